@@ -1,0 +1,32 @@
+SHELL=/bin/bash
+LINT_PATHS=sb3_causalgdp/ tests/ examples/ $(wildcard benchmarks/*.py)
+
+pytest:
+	pytest -n 2 tests/
+
+mypy:
+	mypy ${LINT_PATHS}
+
+type: mypy
+
+lint:
+	ruff check ${LINT_PATHS}
+
+format:
+	# Sort imports
+	ruff check --select I ${LINT_PATHS} --fix
+	# Reformat
+	ruff format ${LINT_PATHS}
+
+check-codestyle:
+	# Sort imports
+	ruff check --select I ${LINT_PATHS}
+	# Reformat
+	ruff format --check ${LINT_PATHS}
+
+commit-checks: format type lint
+
+clean:
+	rm -rf build/ dist/ *.egg-info .pytest_cache .mypy_cache .ruff_cache .coverage htmlcov
+
+.PHONY: pytest mypy type lint format check-codestyle commit-checks clean

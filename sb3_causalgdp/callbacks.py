@@ -1,0 +1,159 @@
+"""The causal world model's schedule: every N environment steps, moments, discovery, masks."""
+
+import time
+import warnings
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
+from stable_baselines3.common.callbacks import BaseCallback
+
+from sb3_causalgdp.causal import make_discovery
+from sb3_causalgdp.diagnostics import guidance_divergence, step_size_bound
+
+if TYPE_CHECKING:
+    from sb3_causalgdp.causalgdp import CausalGDP
+
+
+class CausalWorldModelCallback(BaseCallback):
+    """
+    Every ``refresh_freq`` environment steps: feed the new transitions to the moments, rediscover the causal graph and write its
+    masks into the world model.
+
+    :class:`~sb3_causalgdp.CausalGDP` adds one by itself; passing an own instance to ``learn()`` replaces it. The schedule and the
+    moments live on the model, so that they go on after ``save`` and ``load`` and with ``reset_num_timesteps=False``.
+
+    :param refresh_freq: Environment steps between refreshes, None for the model's ``causal_refresh_freq``
+    :param min_transitions: Transitions that are needed before the first discovery, None for ten for each cause (and 200 at least)
+    :param diagnostics_batch_size: Replay transitions on which the logged divergence and step-size bound are computed, 0 for none
+    :param verbose: Verbosity level: 1 prints each refresh
+    """
+
+    model: "CausalGDP"
+    FEED_ROWS = 10_000
+
+    def __init__(
+        self,
+        refresh_freq: int | None = None,
+        min_transitions: int | None = None,
+        diagnostics_batch_size: int = 64,
+        verbose: int = 0,
+    ) -> None:
+        super().__init__(verbose)
+        if refresh_freq is not None and refresh_freq < 1:
+            raise ValueError(f"refresh_freq must be at least 1 environment step, got {refresh_freq!r}")
+        self.refresh_freq = refresh_freq
+        self.min_transitions = min_transitions
+        self.diagnostics_batch_size = diagnostics_batch_size
+        self._said_too_few = False
+        self._said_step_size = False
+
+    def _on_training_start(self) -> None:
+        buffer = self.model.replay_buffer
+        assert buffer is not None
+        if not buffer.full and self.model._moments_position > buffer.pos:
+            # A loaded model starts with an empty buffer
+            self.model._moments_position = 0
+
+    def _on_step(self) -> bool:
+        self.model._steps_since_refresh += self.training_env.num_envs
+        if self.model._steps_since_refresh >= (self.refresh_freq or self.model.causal_refresh_freq):
+            self.refresh()
+        return True
+
+    def refresh(self) -> None:
+        """
+        Feed, discover and write the masks now.
+        """
+        model = self.model
+        start = time.perf_counter()
+        self._feed_moments()
+        model._steps_since_refresh = 0
+        variables, moments = model.transition_variables, model.causal_moments
+        assert moments is not None
+        needed = self.min_transitions
+        if needed is None:
+            needed = max(200, 10 * (variables.n_states + variables.n_actions))
+        if moments.n_samples < needed:
+            self._say_too_few(moments.n_samples, needed)
+            return
+        before = model.causal_graph()
+        discover = make_discovery(model.causal_discovery, **model.causal_discovery_kwargs)
+        graph = replace(discover(moments, variables, model._causal_graph), num_timesteps=int(model.num_timesteps))
+        model.set_causal_graph(graph)
+        self.logger.record("causal/n_edges", graph.n_edges)
+        self.logger.record("causal/change", graph.change_since(before))
+        self.logger.record("causal/refresh_seconds", time.perf_counter() - start)
+        if self.verbose >= 1:
+            print(f"Causal graph at {model.num_timesteps} steps: {graph.n_edges} edges from {graph.n_samples} transitions")
+        self._log_diagnostics()
+
+    def _say_too_few(self, n_samples: int, needed: int) -> None:
+        if not self._said_too_few:
+            self._said_too_few = True
+            warnings.warn(
+                f"Causal discovery waits: it has {n_samples} transitions and needs {needed}. Until then every edge is open and "
+                "the policy is not guided."
+            )
+
+    def _feed_moments(self) -> None:
+        """Hand the moments the rows that were written to the replay buffer since the last time."""
+        buffer = self.model.replay_buffer
+        assert buffer is not None and self.model.causal_moments is not None
+        end = buffer.pos
+        n_rows = (end - self.model._moments_position) % buffer.buffer_size
+        if self.model._steps_since_refresh // buffer.n_envs > buffer.buffer_size:
+            n_rows = buffer.buffer_size
+        positions = np.arange(end - n_rows, end) % buffer.buffer_size
+        rows_per_chunk = max(1, self.FEED_ROWS // buffer.n_envs)
+        for first in range(0, n_rows, rows_per_chunk):
+            rows = self._read(buffer, positions[first : first + rows_per_chunk])
+            if len(rows) > 0:
+                self.model.causal_moments.update(rows)
+        self.model._moments_position = end
+
+    def _read(self, buffer: ReplayBuffer, positions: np.ndarray) -> np.ndarray:
+        """One-step transitions as rows ``[s, a, s', r]``, straight from the buffer's arrays, in the environment's units."""
+        following = (positions + 1) % buffer.buffer_size
+        if isinstance(buffer, DictReplayBuffer):
+            observations = {key: self._state_input(values[positions]) for key, values in buffer.observations.items()}
+            next_observations = {key: self._state_input(values[positions]) for key, values in buffer.next_observations.items()}
+        else:
+            observations = self._state_input(buffer.observations[positions])
+            next_values = buffer.observations[following] if buffer.optimize_memory_usage else buffer.next_observations[positions]
+            next_observations = self._state_input(next_values)
+        actions = buffer.actions[positions].reshape(len(positions) * buffer.n_envs, -1)
+        rows = self.model.transition_variables.stack(
+            self.model.policy.causal_state(observations).cpu().numpy(),
+            actions,
+            self.model.policy.causal_state(next_observations).cpu().numpy(),
+            buffer.rewards[positions].reshape(-1),
+        )
+        if buffer.optimize_memory_usage:
+            # This buffer does not keep the last observation of an episode
+            rows = rows[buffer.dones[positions].reshape(-1) == 0.0]
+        return rows
+
+    def _state_input(self, values: np.ndarray) -> th.Tensor:
+        return th.as_tensor(values.reshape(-1, *values.shape[2:]), device=self.model.device)
+
+    def _log_diagnostics(self) -> None:
+        model = self.model
+        if self.diagnostics_batch_size == 0 or not model.policy.is_guided:
+            return
+        assert model.replay_buffer is not None
+        data = model.replay_buffer.sample(self.diagnostics_batch_size, env=model._vec_normalize_env)
+        model.policy.set_training_mode(False)
+        self.logger.record("guidance/kl", guidance_divergence(model.policy, data.observations))
+        bound = step_size_bound(model.policy, data.observations)
+        self.logger.record("guidance/step_size", bound.step_size)
+        self.logger.record("guidance/step_size_bound", bound.bound)
+        self.logger.record("guidance/lipschitz", bound.guidance_lipschitz)
+        if bound.guidance_exceeds and not self._said_step_size:
+            self._said_step_size = True
+            warnings.warn(
+                f"The guidance is too steep for the sampler's step of {bound.step_size:.3g} (Proposition 1): it alone allows "
+                f"{bound.guidance_bound:.3g}. Use guidance='posterior', a smaller guidance_scale or more diffusion_steps."
+            )

@@ -1,0 +1,142 @@
+"""The gradient of the masked world model's log density by the action: what steers the sampler."""
+
+from collections.abc import Callable
+from typing import NamedTuple, Protocol
+
+import torch as th
+
+from sb3_causalgdp.causal.world_model import ActionResponse, MaskedWorldModel
+
+
+class OutcomeTerm(NamedTuple):
+    """A scalar outcome that is wished for, in units of its standard deviation."""
+
+    error: th.Tensor
+    """(target - prediction) / std, shape ``(batch,)``."""
+    jacobian: th.Tensor
+    """d prediction / d action / std, shape ``(batch, d)``."""
+
+
+class OutcomeTarget(Protocol):
+    """What the guidance wishes for: a prediction, its derivative by the action and the value that it should take."""
+
+    def __call__(self, response: ActionResponse) -> OutcomeTerm:
+        """
+        :param response: What the world model predicts at the action
+        :return: The outcome's error and Jacobian
+        """
+        ...  # pragma: no cover
+
+
+class RewardTarget:
+    """
+    The paper's target: the reward should be r*, a high quantile of the rewards seen. Sees one step ahead.
+
+    :param reward: r*, shape ``()``
+    """
+
+    def __init__(self, reward: th.Tensor) -> None:
+        self.reward = reward
+
+    def __call__(self, response: ActionResponse) -> OutcomeTerm:
+        error = (self.reward - response.reward) / response.reward_std
+        return OutcomeTerm(error, response.reward_jacobian / response.reward_std)
+
+
+class ReturnTarget:
+    """
+    The return ``R = r + gamma V(s')``, through the causal model, should be one standard deviation of Q above its prediction.
+
+    Sees as far as the critics do (a one-step value expansion).
+
+    :param value_gradient: Gives V and dV / ds' at next states, shapes ``(batch,)`` and ``(batch, n)``
+    :param discount: Discount factor gamma
+    :param std: Standard deviation of Q, shape ``()``
+    """
+
+    def __init__(
+        self, value_gradient: Callable[[th.Tensor], tuple[th.Tensor, th.Tensor]], discount: float, std: th.Tensor
+    ) -> None:
+        self.value_gradient = value_gradient
+        self.discount = discount
+        self.std = std
+
+    def __call__(self, response: ActionResponse) -> OutcomeTerm:
+        _, by_state = self.value_gradient(response.next_state)
+        through_value = th.einsum("bj,bji->bi", by_state, response.next_state_jacobian)
+        jacobian = (response.reward_jacobian + self.discount * through_value) / self.std
+        return OutcomeTerm(th.ones_like(response.reward), jacobian)
+
+
+class CausalGuidance:
+    """
+    ``gamma grad log p(s* | s, do(a)) + beta grad log p(outcome* | s', do(a))`` with its Gauss-Newton curvature.
+
+    It satisfies the protocol of a guidance of the samplers. gamma and beta scale the precisions of the two densities.
+
+    :param world_model: The masked world model
+    :param state: s, shape ``(batch, n)``
+    :param next_state: The next state s* that is wished for, shape ``(batch, n)``
+    :param outcome: The reward or return that is wished for
+    :param state_scale: gamma, at least 0
+    :param outcome_scale: beta, at least 0
+    """
+
+    def __init__(
+        self,
+        world_model: MaskedWorldModel,
+        state: th.Tensor,
+        next_state: th.Tensor,
+        outcome: OutcomeTarget,
+        state_scale: float = 1.0,
+        outcome_scale: float = 1.0,
+    ) -> None:
+        for name, value in (("state_scale", state_scale), ("outcome_scale", outcome_scale)):
+            if not 0.0 <= value < float("inf"):
+                raise ValueError(f"{name} must be a finite number of at least 0, got {value!r}")
+        self.world_model = world_model
+        self.state = state
+        self.next_state = next_state
+        self.outcome = outcome
+        self.state_scale = state_scale
+        self.outcome_scale = outcome_scale
+
+    @th.no_grad()
+    def __call__(self, action: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """
+        :param action: Clean actions, shape ``(batch, d)``
+        :return: Gradient, shape ``(batch, d)``, and curvature, shape ``(batch, d, d)``
+        """
+        response = self.world_model.action_response(self.state, action)
+        outcome = self.outcome(response)
+        gradient = self.outcome_scale * outcome.error.unsqueeze(1) * outcome.jacobian
+        curvature = self.outcome_scale * outcome.jacobian.unsqueeze(2) * outcome.jacobian.unsqueeze(1)
+        if self.state_scale > 0.0:
+            error = (self.next_state - response.next_state) / response.next_state_std
+            jacobian = response.next_state_jacobian / response.next_state_std.unsqueeze(1)
+            gradient = gradient + self.state_scale * th.einsum("bj,bji->bi", error, jacobian)
+            curvature = curvature + self.state_scale * (jacobian.mT @ jacobian)
+        return gradient, curvature
+
+
+class LinearisedGuidance:
+    """
+    A guidance taken at one action and continued linearly, ``v(a) = v(a_0) - P (a - a_0)``: exact where the model is linear.
+
+    The steps of a sampler then share one evaluation of the model. The outcome's target stays where it was at a_0.
+
+    :param guidance: The guidance
+    :param action: a_0, shape ``(batch, d)``
+    """
+
+    def __init__(self, guidance: CausalGuidance, action: th.Tensor) -> None:
+        self.action = action
+        self.gradient, self.curvature = guidance(action)
+
+    def __call__(self, action: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """
+        :param action: Clean actions, shape ``(batch, d)``
+        :return: Gradient, shape ``(batch, d)``, and curvature, shape ``(batch, d, d)``
+        """
+        change = (self.curvature @ (action - self.action).unsqueeze(2)).squeeze(2)
+        return self.gradient - change, self.curvature

@@ -1,0 +1,489 @@
+"""CausalGDP: what happens when."""
+
+import math
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any, ClassVar, TypeVar
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList
+from stable_baselines3.common.noise import ActionNoise
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.policies import BasePolicy, ContinuousCritic
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+from stable_baselines3.common.utils import FloatSchedule, get_parameters_by_name, polyak_update, update_learning_rate
+
+from sb3_causalgdp.callbacks import CausalWorldModelCallback
+from sb3_causalgdp.causal import CausalGraph, StreamingMoments, TransitionVariables, make_discovery
+from sb3_causalgdp.causal.world_model import MaskedWorldModel
+from sb3_causalgdp.losses import critic_loss, denoising_loss, q_loss, td_target, world_model_loss
+from sb3_causalgdp.policies import CausalGDPPolicy, CnnPolicy, DiffusionActor, MlpPolicy, MultiInputPolicy
+
+SelfCausalGDP = TypeVar("SelfCausalGDP", bound="CausalGDP")
+
+
+class CausalGDP(OffPolicyAlgorithm):
+    """
+    Causality-Guided Diffusion Policy (CausalGDP).
+
+    Paper: "CausalGDP: Causality-Guided Diffusion Policies for Reinforcement Learning" (Xiao, Hu, Ye and Yue). The actor, its loss
+    and the critics are those of Diffusion-QL (https://arxiv.org/abs/2208.06193); without guidance
+    (``guidance=None`` or ``guidance_scale=0``) the algorithm is Diffusion-QL.
+
+    :param policy: The policy model to use (MlpPolicy, CnnPolicy, MultiInputPolicy)
+    :param env: The environment to learn from (if registered in Gymnasium, can be str); actions must be a bounded Box
+    :param learning_rate: Learning rate of the actor, and of the critics unless ``critic_learning_rate`` is given; it can be a
+        function of the current progress remaining (from 1 to 0)
+    :param buffer_size: Size of the replay buffer
+    :param learning_starts: How many steps of the model to collect transitions for before learning starts
+    :param batch_size: Minibatch size for each gradient update
+    :param tau: The soft update coefficient ("Polyak update", between 0 and 1) of the target critics and of the actor's moving
+        average
+    :param gamma: The discount factor
+    :param train_freq: Update the model every ``train_freq`` steps. Alternatively pass a tuple of frequency and unit
+        like ``(5, "step")`` or ``(2, "episode")``.
+    :param gradient_steps: How many gradient steps to do after each rollout (see ``train_freq``)
+        Set to ``-1`` means to do as many gradient steps as steps done in the environment during the rollout.
+    :param action_noise: The action noise type (None by default), on top of ``exploration_noise``
+    :param replay_buffer_class: Replay buffer class to use (for instance ``HerReplayBuffer``).
+        If ``None``, it will be automatically selected.
+    :param replay_buffer_kwargs: Keyword arguments to pass to the replay buffer on creation.
+    :param optimize_memory_usage: Enable a memory efficient variant of the replay buffer at a cost of more complexity.
+    :param n_steps: When n_step > 1, uses n-step return (with the NStepReplayBuffer) when updating the Q-value network; the world
+        model still learns from single steps.
+    :param critic_learning_rate: Learning rate of the critics, a number or a schedule; None takes ``learning_rate``
+    :param world_model_learning_rate: Learning rate of the world model, a number or a schedule
+    :param eta: Weight of the Q term in the policy loss (the paper's table: 0.005 to 5)
+    :param denoising_weight: Weight of the denoising term in the policy loss: 1 is Diffusion-QL's, for fixed datasets; online,
+        where it pulls towards the actions of older policies, it has to be small
+    :param max_q_backup: Whether the TD target takes the best of ten sampled actions (Diffusion-QL, for AntMaze)
+    :param max_grad_norm: Bound of the gradient norms of the actor and of the critics, None for no bound
+    :param diffusion_steps: Number of diffusion steps K
+    :param noise_schedule: ``vp`` (Diffusion-QL), ``linear`` (DDPM) or ``cosine``
+    :param sampler: ``ddpm`` or ``ddim``
+    :param ddim_eta: Noise of DDIM, from 0 (deterministic) to 1 (DDPM)
+    :param n_action_candidates: Number of sampled actions of which a prediction takes the best by the smallest target Q
+    :param exploration_noise: Standard deviation of the Gaussian noise of non-deterministic predictions, for actions in [-1, 1]
+    :param guidance: ``posterior`` (the gradient of log p(y | a^k), with the uncertainty of the clean action in it), ``score``
+        (the paper's plain gradient), ``normalized`` (unit length), or None
+    :param guidance_target: What is wished for: ``return`` (one standard deviation of Q more than predicted) or ``reward`` (r*, the
+        running 0.99 quantile of the rewards)
+    :param guidance_covariance: ``tweedie``, ``isotropic`` or ``unit_gaussian``, for ``guidance="posterior"``
+    :param guidance_scale: lambda_k: one number, or one for each diffusion step from k = 1 to K
+    :param state_guidance_scale: gamma_t of the paper, scales the precision of the next state
+    :param outcome_guidance_scale: beta_t of the paper, scales the precision of the reward or return
+    :param causal_discovery: Name of the discovery method (``notears``), or a callable like
+        :class:`~sb3_causalgdp.causal.discovery.DiscoveryMethod`
+    :param causal_discovery_kwargs: Arguments of the named discovery method
+    :param causal_refresh_freq: Rediscover the graph and rewrite the masks every so many environment steps
+    :param causal_half_life: Half-life, in transitions, of the moments from which the graph is found; None forgets nothing
+    :param stats_window_size: Window size for the rollout logging, specifying the number of episodes to average
+        the reported success rate, mean episode length, and mean reward over
+    :param tensorboard_log: The log location for tensorboard (if None, no logging)
+    :param policy_kwargs: Additional arguments to be passed to the policy on creation, see
+        :class:`~sb3_causalgdp.policies.CausalGDPPolicy`
+    :param verbose: Verbosity level: 0 for no output, 1 for info messages (such as device or wrappers used), 2 for debug messages
+    :param seed: Seed for the pseudo random generators
+    :param device: Device (cpu, cuda, ...) on which the code should be run.
+        Setting it to auto, the code will be run on the GPU if possible.
+    :param _init_setup_model: Whether or not to build the network at the creation of the instance
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
+        "MlpPolicy": MlpPolicy,
+        "CnnPolicy": CnnPolicy,
+        "MultiInputPolicy": MultiInputPolicy,
+    }
+    policy: CausalGDPPolicy
+    actor: DiffusionActor
+    actor_target: DiffusionActor
+    critic: ContinuousCritic
+    critic_target: ContinuousCritic
+    world_model: MaskedWorldModel
+
+    # Share of a batch's statistic that enters the running reward quantile and the running standard deviation of Q
+    RUNNING_WEIGHT = 0.01
+    REWARD_QUANTILE = 0.99
+    N_BACKUP_ACTIONS = 10
+
+    def __init__(
+        self,
+        policy: str | type[CausalGDPPolicy],
+        env: GymEnv | str,
+        learning_rate: float | Schedule = 1e-3,
+        buffer_size: int = 1_000_000,  # 1e6
+        learning_starts: int = 100,
+        batch_size: int = 256,
+        tau: float = 0.005,
+        gamma: float = 0.99,
+        train_freq: int | tuple[int, str] = 1,
+        gradient_steps: int = 1,
+        action_noise: ActionNoise | None = None,
+        replay_buffer_class: type[ReplayBuffer] | None = None,
+        replay_buffer_kwargs: dict[str, Any] | None = None,
+        optimize_memory_usage: bool = False,
+        n_steps: int = 1,
+        critic_learning_rate: float | Schedule | None = None,
+        world_model_learning_rate: float | Schedule = 1e-3,
+        eta: float = 1.0,
+        denoising_weight: float = 0.05,
+        max_q_backup: bool = False,
+        max_grad_norm: float | None = None,
+        diffusion_steps: int = 5,
+        noise_schedule: str = "vp",
+        sampler: str = "ddpm",
+        ddim_eta: float = 0.0,
+        n_action_candidates: int = 10,
+        exploration_noise: float = 0.1,
+        guidance: str | None = "posterior",
+        guidance_target: str = "return",
+        guidance_covariance: str = "unit_gaussian",
+        guidance_scale: float | Sequence[float] = 1.0,
+        state_guidance_scale: float = 1.0,
+        outcome_guidance_scale: float = 1.0,
+        causal_discovery: str | Callable[..., CausalGraph] = "notears",
+        causal_discovery_kwargs: dict[str, Any] | None = None,
+        causal_refresh_freq: int = 1_000,
+        causal_half_life: float | None = None,
+        stats_window_size: int = 100,
+        tensorboard_log: str | None = None,
+        policy_kwargs: dict[str, Any] | None = None,
+        verbose: int = 0,
+        seed: int | None = None,
+        device: th.device | str = "auto",
+        _init_setup_model: bool = True,
+    ) -> None:
+        super().__init__(
+            policy,
+            env,
+            learning_rate,
+            buffer_size,
+            learning_starts,
+            batch_size,
+            tau,
+            gamma,
+            train_freq,
+            gradient_steps,
+            action_noise=action_noise,
+            replay_buffer_class=replay_buffer_class,
+            replay_buffer_kwargs=replay_buffer_kwargs,
+            optimize_memory_usage=optimize_memory_usage,
+            n_steps=n_steps,
+            policy_kwargs=policy_kwargs,
+            stats_window_size=stats_window_size,
+            tensorboard_log=tensorboard_log,
+            verbose=verbose,
+            device=device,
+            seed=seed,
+            sde_support=False,
+            supported_action_spaces=(spaces.Box,),
+            support_multi_env=True,
+        )
+        self.critic_learning_rate = critic_learning_rate
+        self.world_model_learning_rate = world_model_learning_rate
+        self.eta = eta
+        self.denoising_weight = denoising_weight
+        self.max_q_backup = max_q_backup
+        self.max_grad_norm = max_grad_norm
+        self.diffusion_steps = diffusion_steps
+        self.noise_schedule = noise_schedule
+        self.sampler = sampler
+        self.ddim_eta = ddim_eta
+        self.n_action_candidates = n_action_candidates
+        self.exploration_noise = exploration_noise
+        self.guidance = guidance
+        self.guidance_target = guidance_target
+        self.guidance_covariance = guidance_covariance
+        self.guidance_scale = guidance_scale
+        self.state_guidance_scale = state_guidance_scale
+        self.outcome_guidance_scale = outcome_guidance_scale
+        self.causal_discovery = causal_discovery
+        self.causal_discovery_kwargs = causal_discovery_kwargs or {}
+        self.causal_refresh_freq = causal_refresh_freq
+        self.causal_half_life = causal_half_life
+        # What is known of the causal structure, saved with the model
+        self.causal_moments: StreamingMoments | None = None
+        self._causal_graph: CausalGraph | None = None
+        self._steps_since_refresh = 0
+        self._moments_position = 0
+
+        if _init_setup_model:
+            self._setup_model()
+
+    def _setup_model(self) -> None:
+        self._check_arguments()
+        policy_kwargs = self.policy_kwargs
+        # The policy gets our arguments too, but they must not enter the user's own dictionary
+        self.policy_kwargs = {**self._own_policy_kwargs(), **policy_kwargs}
+        try:
+            super()._setup_model()
+        finally:
+            self.policy_kwargs = policy_kwargs
+        self._create_aliases()
+        make_discovery(self.causal_discovery, **self.causal_discovery_kwargs)
+        action_names = tuple(f"action[{index}]" for index in range(self.actor.action_dim))
+        self.transition_variables = TransitionVariables(self.policy.state_names(), action_names)
+        if self.causal_moments is None:
+            variables = self.transition_variables
+            self.causal_moments = StreamingMoments(variables.n_variables, self.causal_half_life, variables.names)
+        # Running mean and running var
+        self.actor_batch_norm_stats = get_parameters_by_name(self.actor, ["running_"])
+        self.critic_batch_norm_stats = get_parameters_by_name(self.critic, ["running_"])
+        self.actor_batch_norm_stats_target = get_parameters_by_name(self.actor_target, ["running_"])
+        self.critic_batch_norm_stats_target = get_parameters_by_name(self.critic_target, ["running_"])
+
+    def _check_arguments(self) -> None:
+        for name in ("eta", "denoising_weight"):
+            value = getattr(self, name)
+            if not 0.0 <= value < math.inf:
+                raise ValueError(f"{name} must be a finite number of at least 0, got {value!r}")
+        if self.causal_refresh_freq < 1:
+            raise ValueError(f"causal_refresh_freq must be at least 1 environment step, got {self.causal_refresh_freq!r}")
+        if self.max_grad_norm is not None and self.max_grad_norm <= 0.0:
+            raise ValueError(f"max_grad_norm must be positive or None, got {self.max_grad_norm!r}")
+
+    def _own_policy_kwargs(self) -> dict[str, Any]:
+        names = (
+            "diffusion_steps noise_schedule sampler ddim_eta n_action_candidates exploration_noise guidance guidance_target "
+            "guidance_covariance guidance_scale state_guidance_scale outcome_guidance_scale"
+        ).split()
+        return {**{name: getattr(self, name) for name in names}, "discount": self.gamma}
+
+    def _create_aliases(self) -> None:
+        self.actor = self.policy.actor
+        self.actor_target = self.policy.actor_target
+        self.critic = self.policy.critic
+        self.critic_target = self.policy.critic_target
+        self.world_model = self.policy.world_model
+
+    def _setup_lr_schedule(self) -> None:
+        super()._setup_lr_schedule()
+        rate = self.critic_learning_rate
+        self.critic_lr_schedule = None if rate is None else FloatSchedule(rate)
+        self.world_model_lr_schedule = FloatSchedule(self.world_model_learning_rate)
+
+    def _update_learning_rates(self) -> None:
+        self._update_learning_rate(self.actor.optimizer)
+        progress = self._current_progress_remaining
+        critic_lr_schedule = self.critic_lr_schedule or self.lr_schedule
+        update_learning_rate(self.critic.optimizer, critic_lr_schedule(progress))
+        update_learning_rate(self.world_model.optimizer, self.world_model_lr_schedule(progress))
+
+    def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
+        callback = super()._init_callback(callback, progress_bar)
+        if any(isinstance(one, CausalWorldModelCallback) for one in _flatten(callback)):
+            return callback
+        # In front of the others, so that evaluations and checkpoints see the new masks
+        callback = CallbackList([CausalWorldModelCallback(), callback])
+        callback.init_callback(self)
+        return callback
+
+    def causal_graph(self) -> CausalGraph:
+        """
+        :return: What causes what, as last discovered; every edge is open before the first discovery
+        """
+        return self._causal_graph or CausalGraph.fully_connected(self.transition_variables)
+
+    def set_causal_graph(self, graph: CausalGraph) -> None:
+        """
+        Write a causal graph into the masks of the world model and let it steer the sampling.
+
+        :param graph: The graph, on this model's variables
+        :raises ValueError: If the graph is about other variables
+        """
+        if graph.variables != self.transition_variables:
+            raise ValueError(
+                f"The graph is about {graph.variables.names}, but this model's variables are {self.transition_variables.names}"
+            )
+        masks = (graph.state_to_state, graph.action_to_state, graph.state_to_reward, graph.action_to_reward)
+        self.world_model.set_masks(*(th.as_tensor(mask, dtype=th.float32, device=self.device) for mask in masks))
+        self.policy.guidance_ready.fill_(1.0)
+        self._causal_graph = graph
+
+    def train(self, gradient_steps: int, batch_size: int = 256) -> None:
+        # Switch to train mode (this affects batch norm / dropout)
+        self.policy.set_training_mode(True)
+        self._update_learning_rates()
+        losses: dict[str, list[float]] = {}
+        for _ in range(gradient_steps):
+            self._n_updates += 1
+            replay_data = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)  # type: ignore[union-attr]
+            one_step = self._sample_one_step(batch_size) if self.n_steps > 1 else replay_data
+            next_actions, step_losses = self._update_critics(replay_data)
+            step_losses.update(self._update_world_model(one_step))
+            step_losses.update(self._update_actor(replay_data, one_step, next_actions))
+            self._update_targets()
+            for name, loss in step_losses.items():
+                losses.setdefault(name, []).append(loss.item())
+
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+        for name, values in losses.items():
+            self.logger.record(f"train/{name}", np.mean(values))
+
+    def _sample_one_step(self, batch_size: int):
+        # The n-step buffer gives n-step rewards and observations, which are wrong for a one-step world model
+        assert isinstance(self.replay_buffer, NStepReplayBuffer)
+        indices = np.random.randint(0, self.replay_buffer.size(), size=batch_size)
+        return ReplayBuffer._get_samples(self.replay_buffer, indices, env=self._vec_normalize_env)
+
+    def _update_critics(self, replay_data) -> tuple[th.Tensor, dict[str, th.Tensor]]:
+        with th.no_grad():
+            next_actions, target = self._td_target(replay_data)
+        q_values = self.critic(replay_data.observations, replay_data.actions)
+        loss = critic_loss(q_values, target)
+        self._optimize(self.critic, loss)
+        with th.no_grad():
+            self.policy.return_std.lerp_(target.std(correction=0).clamp(min=1e-3), self._running_weight())
+        return next_actions, {"critic_loss": loss.detach()}
+
+    def _td_target(self, replay_data) -> tuple[th.Tensor, th.Tensor]:
+        # For n-step replay, discount factor is gamma**n_steps (when no early termination)
+        discounts = replay_data.discounts if replay_data.discounts is not None else self.gamma
+        n_actions = self.N_BACKUP_ACTIONS if self.max_q_backup else 1
+        next_observations = replay_data.next_observations
+        actor_features = self.actor_target.features(next_observations).repeat_interleave(n_actions, dim=0)
+        next_actions = self.actor_target.sample(actor_features)
+        critic_features = self.critic_target.extract_features(next_observations, self.critic_target.features_extractor)
+        inputs = th.cat([critic_features.repeat_interleave(n_actions, dim=0), next_actions], dim=1)
+        next_q_values = [network(inputs) for network in self.critic_target.q_networks]
+        target = td_target(next_q_values, replay_data.rewards, replay_data.dones, discounts, n_actions)
+        return next_actions[::n_actions], target
+
+    def _running_weight(self) -> float:
+        # The first batches are averaged, so that the start value is forgotten at once
+        return max(1.0 / self._n_updates, self.RUNNING_WEIGHT)
+
+    def _update_world_model(self, transitions) -> dict[str, th.Tensor]:
+        state = self.policy.causal_state(transitions.observations)
+        next_state = self.policy.causal_state(transitions.next_observations)
+        rewards = transitions.rewards.flatten()
+        with th.no_grad():
+            quantile = th.quantile(rewards, self.REWARD_QUANTILE)
+            self.policy.reward_target.lerp_(quantile, self._running_weight())
+        # The memory efficient buffer does not keep the last observation of an episode
+        weight = 1.0 - transitions.dones.flatten() if self.optimize_memory_usage else None
+        self.world_model.update_statistics(state, next_state, rewards)
+        transition, reward = world_model_loss(self.world_model, state, transitions.actions, next_state, rewards, weight)
+        self._optimize(self.world_model, transition + reward)
+        return {"world_model_transition_loss": transition.detach(), "world_model_reward_loss": reward.detach()}
+
+    def _update_actor(self, replay_data, one_step, next_actions: th.Tensor) -> dict[str, th.Tensor]:
+        features = self.actor.features(replay_data.observations)
+        guidance = rule = None
+        if self.policy.is_guided:
+            rule = self.policy.guidance_rule
+            guidance = self.policy.make_guidance(
+                self.policy.causal_state(replay_data.observations),
+                self.policy.causal_state(replay_data.next_observations),
+                next_actions,
+            )
+        denoising = denoising_loss(
+            self.actor.denoiser, self.actor.schedule, features, replay_data.actions, guidance, rule
+        )
+        with _frozen(self.critic.q_networks):
+            q_values = self.critic(replay_data.observations, self.actor.sample(features))
+            q_term = q_loss(q_values, int(np.random.randint(len(q_values))))
+            loss = self.denoising_weight * denoising + self.eta * q_term
+            self._optimize(self.actor, loss)
+        return {"actor_loss": loss.detach(), "denoising_loss": denoising.detach(), "q_loss": q_term.detach()}
+
+    def _optimize(self, module: th.nn.Module, loss: th.Tensor) -> None:
+        optimizer: th.optim.Optimizer = module.optimizer  # type: ignore[assignment]
+        optimizer.zero_grad()
+        loss.backward()
+        if self.max_grad_norm is not None and module is not self.world_model:
+            th.nn.utils.clip_grad_norm_(module.parameters(), self.max_grad_norm)
+        optimizer.step()
+
+    def _update_targets(self) -> None:
+        polyak_update(self.critic.parameters(), self.critic_target.parameters(), self.tau)
+        polyak_update(self.actor.parameters(), self.actor_target.parameters(), self.tau)
+        # Copy running stats, see SB3's GH issue #996
+        polyak_update(self.critic_batch_norm_stats, self.critic_batch_norm_stats_target, 1.0)
+        polyak_update(self.actor_batch_norm_stats, self.actor_batch_norm_stats_target, 1.0)
+
+    def learn(
+        self: SelfCausalGDP,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int = 4,
+        tb_log_name: str = "CausalGDP",
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> SelfCausalGDP:
+        return super().learn(
+            total_timesteps=total_timesteps,
+            callback=callback,
+            log_interval=log_interval,
+            tb_log_name=tb_log_name,
+            reset_num_timesteps=reset_num_timesteps,
+            progress_bar=progress_bar,
+        )
+
+    def _setup_learn(self, *args, **kwargs) -> tuple[int, BaseCallback]:
+        result = super()._setup_learn(*args, **kwargs)
+        self._check_finite(self._last_obs, "observation")
+        return result
+
+    def _store_transition(self, replay_buffer, buffer_action, new_obs, reward, dones, infos) -> None:
+        # Before anything is written: one NaN would spread from the buffer to every network and to the graph
+        self._check_finite(new_obs, "observation")
+        self._check_finite(reward, "reward")
+        for info, done in zip(infos, dones, strict=True):
+            if done and info.get("terminal_observation") is not None:
+                self._check_finite(info["terminal_observation"], "terminal observation")
+        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
+
+    def _check_finite(self, values, name: str) -> None:
+        if isinstance(values, dict):
+            for key, part in values.items():
+                self._check_finite(part, f"{name}[{key!r}]")
+        elif not np.isfinite(values).all():
+            where = np.argwhere(~np.isfinite(np.atleast_1d(values)))[0].tolist()
+            raise ValueError(
+                f"The environment returned a NaN or infinite {name} at step {self.num_timesteps}, index {where}: "
+                f"{np.atleast_1d(values)[tuple(where)]}. Nothing of this step was stored; see VecCheckNan to find its origin."
+            )
+
+    def _excluded_save_params(self) -> list[str]:
+        return super()._excluded_save_params() + [  # noqa: RUF005
+            "actor",
+            "actor_target",
+            "critic",
+            "critic_target",
+            "world_model",
+            "actor_batch_norm_stats",
+            "critic_batch_norm_stats",
+            "actor_batch_norm_stats_target",
+            "critic_batch_norm_stats_target",
+        ]
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        state_dicts = ["policy", "actor.optimizer", "critic.optimizer", "world_model.optimizer"]
+        return state_dicts, []
+
+
+@contextmanager
+def _frozen(modules: Iterable[th.nn.Module]) -> Iterator[None]:
+    """No gradients for these parameters: the actor's loss flows through the critics, but does not train them."""
+    for module in modules:
+        module.requires_grad_(False)
+    try:
+        yield
+    finally:
+        for module in modules:
+            module.requires_grad_(True)
+
+
+def _flatten(callback: BaseCallback) -> list[BaseCallback]:
+    """The callback and all that it holds, through lists and event callbacks."""
+    found = [callback]
+    for one in getattr(callback, "callbacks", []):
+        found += _flatten(one)
+    child = getattr(callback, "callback", None)
+    if isinstance(child, BaseCallback):
+        found += _flatten(child)
+    return found

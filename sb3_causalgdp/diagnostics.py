@@ -1,0 +1,92 @@
+"""What the paper's theory says of the policy as it is: divergence by guidance (Theorem 1) and step size (Proposition 1)."""
+
+import math
+from dataclasses import dataclass
+
+import torch as th
+from stable_baselines3.common.type_aliases import PyTorchObs
+
+from sb3_causalgdp.diffusion.guidance import guidance_shift
+from sb3_causalgdp.diffusion.samplers import bind
+from sb3_causalgdp.policies import CausalGDPPolicy
+
+
+@th.no_grad()
+def guidance_divergence(policy: CausalGDPPolicy, observations: PyTorchObs) -> float:
+    """
+    KL(pi_cg || pi) along the chain, the mean over a batch: the sum over k of ``||mu_cg - mu||^2 / (2 sigma_k^2)``.
+
+    :param policy: A policy whose guidance is on
+    :param observations: A batch of observations
+    :return: The divergence, at least 0; Theorem 1 bounds the change of the return by its square root
+    """
+    divergences: list[th.Tensor] = []
+    features = policy.actor.features(observations)
+    guidance = policy.acting_guidance(policy.causal_state(observations), policy.actor.sample(features))
+    policy.actor.sample(features, None, guidance, policy.guidance_rule, divergences)
+    return float(th.stack(divergences).sum(dim=0).mean())
+
+
+@dataclass(frozen=True)
+class StepSizeBound:
+    """
+    Proposition 1 on a batch, in diffusion time, which runs from 0 to 1.
+
+    :param step_size: Step of the sampler, 1 / K
+    :param bound: ``delta / L_sum``, the smallest over the diffusion steps
+    :param guidance_bound: ``delta / (g^2 lambda_k L_G)``, what the guidance alone allows
+    :param guidance_lipschitz: The largest Lipschitz constant ``lambda_k L_G`` of the guidance
+    """
+
+    step_size: float
+    bound: float
+    guidance_bound: float
+    guidance_lipschitz: float
+
+    @property
+    def guidance_exceeds(self) -> bool:
+        """
+        Whether the guidance alone breaks the bound. The drift and the score of the diffusion itself are no cause for alarm:
+        DDPM and DDIM integrate them exactly, which the Euler scheme of Proposition 1 does not.
+        """
+        return self.step_size > self.guidance_bound
+
+
+@th.no_grad()
+def step_size_bound(policy: CausalGDPPolicy, observations: PyTorchObs, delta: float = 1.0) -> StepSizeBound:
+    """
+    ``delta / (L_f + g^2 (L_s + lambda_k L_G))`` with the Lipschitz constants of drift, score and guidance.
+
+    The guidance is added to the score, so it comes with g^2, in which this differs from the paper's equation. Constants are
+    estimated on the batch, from the largest change of score and guidance under a small random change of the noisy action.
+
+    :param policy: A policy whose guidance is on
+    :param observations: A batch of observations
+    :param delta: The paper's delta, in (0, 1]
+    :return: The bounds
+    """
+    actor, schedule, rule = policy.actor, policy.actor.schedule, policy.guidance_rule
+    assert rule is not None
+    features = actor.features(observations)
+    predict_noise = bind(actor.denoiser, features)
+    actions = actor.sample(features)
+    guidance = policy.acting_guidance(policy.causal_state(observations), actions)
+    bound = guidance_bound = math.inf
+    largest = 0.0
+    for step in range(schedule.n_steps):
+        steps = th.full((len(actions),), step, device=actions.device)
+        noisy = schedule.add_noise(actions, th.randn_like(actions), steps)
+        change = 0.1 * th.nn.functional.normalize(th.randn_like(actions), dim=1)
+        noises, shifts = [], []
+        for point in (noisy, noisy + change):
+            noises.append(predict_noise(point, step))
+            shifts.append(guidance_shift(guidance, rule, predict_noise, schedule, point, noises[-1], step))
+        # Both are minus a score times sqrt(1 - alpha_bar)
+        spread = math.sqrt(1.0 - schedule.alpha_bar_list[step]) * 0.1
+        score_lipschitz = float((noises[1] - noises[0]).norm(dim=1).max()) / spread
+        guidance_lipschitz = float((shifts[1] - shifts[0]).norm(dim=1).max()) / spread
+        rate = -math.log1p(-schedule.beta_list[step]) * schedule.n_steps
+        bound = min(bound, delta / (0.5 * rate + rate * (score_lipschitz + guidance_lipschitz)))
+        guidance_bound = min(guidance_bound, delta / (rate * max(guidance_lipschitz, 1e-12)))
+        largest = max(largest, guidance_lipschitz)
+    return StepSizeBound(1.0 / schedule.n_steps, bound, guidance_bound, largest)

@@ -1,0 +1,92 @@
+"""Networks that predict the noise in an action."""
+
+import math
+from collections.abc import Callable
+from itertools import pairwise
+
+import torch as th
+import torch.nn.functional as F
+from torch import nn
+
+
+def sinusoidal_embedding(n_steps: int, dimension: int) -> th.Tensor:
+    """
+    Sinusoidal embedding of the diffusion steps (Vaswani et al., 2017, as used by Diffusion-QL).
+
+    :param n_steps: Number of diffusion steps K
+    :param dimension: Size of the embedding, an even number of at least 4
+    :return: Table of shape ``(K, dimension)``
+    """
+    if dimension < 4 or dimension % 2:
+        raise ValueError(f"time_embedding_dim must be an even number of at least 4, got {dimension}")
+    half = dimension // 2
+    frequency = th.exp(th.arange(half) * (-math.log(10_000) / (half - 1)))
+    angle = th.arange(n_steps).unsqueeze(1) * frequency
+    return th.cat([angle.sin(), angle.cos()], dim=1)
+
+
+class MLPDenoiser(nn.Module):
+    """
+    Predicts the noise eps_theta(a^k, k, s) with a multi-layer perceptron on ``[a^k, embedding of k, condition]``.
+
+    :param action_dim: Number of action components d
+    :param condition_dim: Number of features of the observation
+    :param n_steps: Number of diffusion steps K
+    :param net_arch: Hidden layers, ``[]`` is a linear denoiser
+    :param activation_fn: Activation class
+    :param time_embedding_dim: Size of the embedding of the diffusion step
+    """
+
+    time_table: th.Tensor
+
+    def __init__(
+        self,
+        action_dim: int,
+        condition_dim: int,
+        n_steps: int,
+        net_arch: list[int],
+        activation_fn: type[nn.Module] = nn.Mish,
+        time_embedding_dim: int = 16,
+    ) -> None:
+        super().__init__()
+        self.action_dim = action_dim
+        self.register_buffer("time_table", sinusoidal_embedding(n_steps, time_embedding_dim), persistent=False)
+        self.time_mlp = nn.Sequential(
+            nn.Linear(time_embedding_dim, 2 * time_embedding_dim),
+            nn.Mish(),
+            nn.Linear(2 * time_embedding_dim, time_embedding_dim),
+        )
+        first, *rest = [*net_arch, action_dim]
+        self.input_layer = nn.Linear(action_dim + time_embedding_dim + condition_dim, first)
+        layers: list[nn.Module] = []
+        for inputs, outputs in pairwise([first, *rest]):
+            layers += [activation_fn(), nn.Linear(inputs, outputs)]
+        self.network = nn.Sequential(*layers)
+
+    def bind(self, condition: th.Tensor) -> Callable[[th.Tensor, int | th.Tensor], th.Tensor]:
+        """
+        Do what is the same for all steps of a chain once: the condition's and the steps' parts of the first layer.
+
+        :param condition: Features of the observation, shape ``(batch, condition_dim)``
+        :return: Predicts the noise from the noisy action and the diffusion step, as :meth:`forward` does
+        """
+        time_dim = self.time_table.shape[1]
+        action_weight, time_weight, condition_weight = self.input_layer.weight.split(
+            [self.action_dim, time_dim, condition.shape[1]], dim=1
+        )
+        from_condition = F.linear(condition, condition_weight, self.input_layer.bias)
+        from_time = F.linear(self.time_mlp(self.time_table), time_weight)
+
+        def predict_noise(noisy_action: th.Tensor, step: int | th.Tensor) -> th.Tensor:
+            return self.network(F.linear(noisy_action, action_weight) + (from_condition + from_time[step]))
+
+        return predict_noise
+
+    def forward(self, noisy_action: th.Tensor, step: int | th.Tensor, condition: th.Tensor) -> th.Tensor:
+        """
+        :param noisy_action: a^k, shape ``(batch, d)``
+        :param step: Index of the diffusion step, ``0..K-1``: one for all, or shape ``(batch,)``
+        :param condition: Features of the observation, shape ``(batch, condition_dim)``
+        :return: Predicted noise, shape ``(batch, d)``
+        """
+        return self.bind(condition)(noisy_action, step)

@@ -1,0 +1,131 @@
+"""How much of the action is left at each diffusion step."""
+
+import math
+from collections.abc import Callable
+
+import torch as th
+from torch import nn
+
+
+def vp_betas(n_steps: int, beta_min: float = 0.1, beta_max: float = 10.0) -> th.Tensor:
+    """
+    Variance-preserving SDE, integrated exactly over each of the steps (Song et al., 2021; Diffusion-QL, Wang et al., 2023).
+
+    :param n_steps: Number of diffusion steps K
+    :param beta_min: Noise rate at the clean end, per unit of diffusion time
+    :param beta_max: Noise rate at the noise end
+    :return: beta_k for k = 1..K, shape ``(K,)``, float64
+    """
+    step = th.arange(1, n_steps + 1, dtype=th.float64)
+    rate = beta_min / n_steps + 0.5 * (beta_max - beta_min) * (2 * step - 1) / n_steps**2
+    return 1.0 - th.exp(-rate)
+
+
+def linear_betas(n_steps: int, beta_start: float = 1e-4, beta_end: float = 2e-2) -> th.Tensor:
+    """
+    DDPM's 1000 linear steps (Ho et al., 2020), thinned out to K steps.
+
+    DDPM's own betas leave 95 % of the signal after five steps, yet sampling starts from pure noise. The cumulative product
+    of the 1000 steps is therefore read at K evenly spaced times: equal to DDPM at K = 1000, usable at every K.
+
+    :param n_steps: Number of diffusion steps K
+    :param beta_start: First of the 1000 betas
+    :param beta_end: Last of the 1000 betas
+    :return: beta_k for k = 1..K, shape ``(K,)``, float64
+    """
+    reference_steps = 1000
+    log_alpha_bar = th.log1p(-th.linspace(beta_start, beta_end, reference_steps, dtype=th.float64)).cumsum(0)
+    log_alpha_bar = th.cat([th.zeros(1, dtype=th.float64), log_alpha_bar])
+    position = th.arange(n_steps + 1, dtype=th.float64) * reference_steps / n_steps
+    lower = position.floor().long().clamp(max=reference_steps - 1)
+    values = th.lerp(log_alpha_bar[lower], log_alpha_bar[lower + 1], position - lower)
+    return -th.expm1(values.diff())
+
+
+def cosine_betas(n_steps: int, offset: float = 0.008, max_beta: float = 0.999) -> th.Tensor:
+    """
+    Cosine schedule (Nichol & Dhariwal, 2021, equation 17).
+
+    :param n_steps: Number of diffusion steps K
+    :param offset: Keeps the first beta from vanishing
+    :param max_beta: Upper bound of beta_k, reached by the last step
+    :return: beta_k for k = 1..K, shape ``(K,)``, float64
+    """
+    time = th.arange(n_steps + 1, dtype=th.float64) / n_steps
+    alpha_bar = th.cos((time + offset) / (1 + offset) * math.pi / 2) ** 2
+    return (1.0 - alpha_bar[1:] / alpha_bar[:-1]).clamp(max=max_beta)
+
+
+NOISE_SCHEDULES: dict[str, Callable[[int], th.Tensor]] = {
+    "vp": vp_betas,
+    "linear": linear_betas,
+    "cosine": cosine_betas,
+}
+
+
+class NoiseSchedule(nn.Module):
+    """
+    The coefficients of the forward process ``a^k = sqrt(alpha_bar_k) a^0 + sqrt(1 - alpha_bar_k) eps``.
+
+    All are float32 buffers of shape ``(K,)`` that are not saved: they follow from the name and the number of steps. Index
+    ``k - 1`` belongs to the paper's diffusion step ``k = 1..K``.
+
+    :param name: One of ``vp``, ``linear`` and ``cosine``
+    :param n_steps: Number of diffusion steps K, at least 1
+    :raises ValueError: If the name is unknown or there is no step
+    """
+
+    betas: th.Tensor
+    alpha_bar: th.Tensor
+    alpha_bar_previous: th.Tensor
+    sqrt_alpha_bar: th.Tensor
+    sqrt_one_minus_alpha_bar: th.Tensor
+
+    def __init__(self, name: str = "vp", n_steps: int = 5) -> None:
+        super().__init__()
+        if name not in NOISE_SCHEDULES:
+            raise ValueError(f"Unknown noise_schedule {name!r}: it must be one of {sorted(NOISE_SCHEDULES)}")
+        if isinstance(n_steps, bool) or not isinstance(n_steps, int) or n_steps < 1:
+            raise ValueError(f"diffusion_steps must be an integer of at least 1, got {n_steps!r}")
+        self.name = name
+        self.n_steps = n_steps
+        betas = NOISE_SCHEDULES[name](n_steps)
+        alpha_bar = th.cumprod(1.0 - betas, dim=0)
+        alpha_bar_previous = th.cat([th.ones(1, dtype=th.float64), alpha_bar[:-1]])
+        coefficients = {
+            "betas": betas,
+            "alpha_bar": alpha_bar,
+            "alpha_bar_previous": alpha_bar_previous,
+            "sqrt_alpha_bar": alpha_bar.sqrt(),
+            "sqrt_one_minus_alpha_bar": (1.0 - alpha_bar).sqrt(),
+        }
+        for key, value in coefficients.items():
+            self.register_buffer(key, value.float(), persistent=False)
+        # Python floats in double precision: the samplers read one coefficient at a time, without a tensor look-up
+        self.alpha_bar_list: list[float] = alpha_bar.tolist()
+        self.alpha_bar_previous_list: list[float] = alpha_bar_previous.tolist()
+        self.beta_list: list[float] = betas.tolist()
+
+    def add_noise(self, action: th.Tensor, noise: th.Tensor, step: th.Tensor) -> th.Tensor:
+        """
+        Draw from the forward process.
+
+        :param action: Clean actions a^0, shape ``(batch, d)``
+        :param noise: Standard normal noise, shape ``(batch, d)``
+        :param step: Index of the diffusion step, ``0..K-1``, shape ``(batch,)``
+        :return: Noisy actions a^k, shape ``(batch, d)``
+        """
+        return self.sqrt_alpha_bar[step].unsqueeze(1) * action + self.sqrt_one_minus_alpha_bar[step].unsqueeze(1) * noise
+
+    def clean_estimate(self, noisy_action: th.Tensor, noise: th.Tensor, step: th.Tensor) -> th.Tensor:
+        """
+        Invert :meth:`add_noise` for a predicted noise.
+
+        :param noisy_action: a^k, shape ``(batch, d)``
+        :param noise: Predicted noise, shape ``(batch, d)``
+        :param step: Index of the diffusion step, ``0..K-1``, shape ``(batch,)``
+        :return: Estimate of the clean action, shape ``(batch, d)``
+        """
+        return (noisy_action - self.sqrt_one_minus_alpha_bar[step].unsqueeze(1) * noise) / self.sqrt_alpha_bar[
+            step
+        ].unsqueeze(1)

@@ -1,0 +1,531 @@
+"""Diffusion actor, double critics, their targets and the causal world model, as one SB3 policy."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.policies import BasePolicy, ContinuousCritic
+from stable_baselines3.common.preprocessing import get_action_dim, is_image_space, preprocess_obs
+from stable_baselines3.common.torch_layers import (
+    BaseFeaturesExtractor,
+    CombinedExtractor,
+    FlattenExtractor,
+    NatureCNN,
+    get_actor_critic_arch,
+)
+from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
+from torch import nn
+
+from sb3_causalgdp.causal import CausalGuidance, LinearisedGuidance, MaskedWorldModel, ReturnTarget, RewardTarget
+from sb3_causalgdp.causal.guidance import OutcomeTarget
+from sb3_causalgdp.diffusion import Guidance, GuidanceRule, MLPDenoiser, NoiseSchedule, sample
+from sb3_causalgdp.diffusion.samplers import check_sampler
+
+ACTIVATIONS: dict[str, type[nn.Module]] = {
+    "mish": nn.Mish,
+    "silu": nn.SiLU,
+    "relu": nn.ReLU,
+    "tanh": nn.Tanh,
+    "elu": nn.ELU,
+    "gelu": nn.GELU,
+}
+GUIDANCE_TARGETS = ("return", "reward")
+
+
+def activation_class(activation_fn: str | type[nn.Module]) -> type[nn.Module]:
+    """
+    :param activation_fn: Class of the activation, or its name in lower case
+    :return: The class
+    :raises ValueError: If the name is unknown
+    """
+    if not isinstance(activation_fn, str):
+        return activation_fn
+    if activation_fn.lower() not in ACTIVATIONS:
+        raise ValueError(f"Unknown activation_fn {activation_fn!r}: it must be a torch.nn class or one of {sorted(ACTIVATIONS)}")
+    return ACTIVATIONS[activation_fn.lower()]
+
+
+class DiffusionActor(BasePolicy):
+    """
+    Diffusion policy: denoises actions, conditioned on the features of the observation.
+
+    :param observation_space: Observation space
+    :param action_space: Action space
+    :param net_arch: Hidden layers of the denoiser
+    :param features_extractor: Network that turns observations into features
+    :param features_dim: Number of features
+    :param activation_fn: Activation class
+    :param normalize_images: Whether to divide images by 255
+    :param diffusion_steps: Number of diffusion steps K
+    :param noise_schedule: ``vp``, ``linear`` or ``cosine``
+    :param sampler: ``ddpm`` or ``ddim``
+    :param ddim_eta: Noise of DDIM, in [0, 1]
+    """
+
+    def __init__(
+        self,
+        observation_space: spaces.Space,
+        action_space: spaces.Box,
+        net_arch: list[int],
+        features_extractor: BaseFeaturesExtractor,
+        features_dim: int,
+        activation_fn: type[nn.Module] = nn.Mish,
+        normalize_images: bool = True,
+        diffusion_steps: int = 5,
+        noise_schedule: str = "vp",
+        sampler: str = "ddpm",
+        ddim_eta: float = 0.0,
+    ) -> None:
+        super().__init__(
+            observation_space,
+            action_space,
+            features_extractor=features_extractor,
+            normalize_images=normalize_images,
+            squash_output=True,
+        )
+        check_sampler(sampler, ddim_eta)
+        self.action_dim = get_action_dim(action_space)
+        self.sampler = sampler
+        self.ddim_eta = ddim_eta
+        self.schedule = NoiseSchedule(noise_schedule, diffusion_steps)
+        self.denoiser = MLPDenoiser(self.action_dim, features_dim, diffusion_steps, net_arch, activation_fn)
+
+    def features(self, observation: PyTorchObs) -> th.Tensor:
+        """
+        :param observation: Observations as SB3 gives them to policies
+        :return: What the denoiser is conditioned on, shape ``(batch, features_dim)``
+        """
+        return self.extract_features(observation, self.features_extractor)
+
+    def sample(
+        self,
+        features: th.Tensor,
+        noise: th.Tensor | None = None,
+        guidance: Guidance | None = None,
+        rule: GuidanceRule | None = None,
+        divergences: list[th.Tensor] | None = None,
+    ) -> th.Tensor:
+        """
+        Denoise actions, see :func:`sb3_causalgdp.diffusion.sample`.
+
+        :param features: Shape ``(batch, features_dim)``
+        :param noise: Shape ``(K, batch, d)``, drawn if None
+        :param guidance: Causal guidance, None for none
+        :param rule: How the guidance enters a step
+        :param divergences: If a list, each guided step appends its KL divergence
+        :return: Actions in [-1, 1], shape ``(batch, d)``
+        """
+        return sample(
+            self.denoiser,
+            self.schedule,
+            features,
+            guidance,
+            rule,
+            noise=noise,
+            sampler=self.sampler,
+            eta=self.ddim_eta,
+            divergences=divergences,
+        )
+
+    def forward(self, observation: PyTorchObs) -> th.Tensor:
+        return self.sample(self.features(observation))
+
+    def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
+        return self(observation)
+
+
+class CausalGDPPolicy(BasePolicy):
+    """
+    Policy of CausalGDP: diffusion actor, its moving average, critics, their targets and the masked world model.
+
+    Prediction draws candidate actions, imagines the next state of the best of them (by the smallest target Q), steers a second
+    pass of the sampler towards it and towards the outcome that is wished for, and plays the best of what comes out.
+
+    :param observation_space: Observation space
+    :param action_space: Action space
+    :param lr_schedule: Learning rate schedule
+    :param net_arch: Hidden layers of the denoiser and of the critics: a list, or ``dict(pi=[...], qf=[...])``
+    :param activation_fn: Activation of both: a class or its name
+    :param features_extractor_class: Features extractor to use
+    :param features_extractor_kwargs: Keyword arguments of the features extractor
+    :param normalize_images: Whether to divide images by 255
+    :param optimizer_class: Optimizer of the actor, the critics and the world model
+    :param optimizer_kwargs: Its keyword arguments, without the learning rate
+    :param n_critics: Number of critics
+    :param share_features_extractor: Whether actor and critics share one features extractor
+    :param world_model_net_arch: Hidden layers of the world model, all of one size
+    :param diffusion_steps: Number of diffusion steps K
+    :param noise_schedule: ``vp``, ``linear`` or ``cosine``
+    :param sampler: ``ddpm`` or ``ddim``
+    :param ddim_eta: Noise of DDIM, in [0, 1]
+    :param guidance: ``posterior``, ``score``, ``normalized``, or None for no guidance
+    :param guidance_covariance: ``tweedie``, ``isotropic`` or ``unit_gaussian``, see :class:`~sb3_causalgdp.diffusion.GuidanceRule`
+    :param guidance_target: ``return`` or ``reward``
+    :param guidance_scale: lambda_k: one number, or one for each diffusion step
+    :param state_guidance_scale: gamma, scales the precision of the next state
+    :param outcome_guidance_scale: beta, scales the precision of the reward or return
+    :param n_action_candidates: Number of candidates N of which prediction plays the best
+    :param exploration_noise: Standard deviation of the Gaussian noise of stochastic predictions, actions being in [-1, 1]
+    :param discount: Discount factor, for the return target
+    """
+
+    actor: DiffusionActor
+    actor_target: DiffusionActor
+    critic: ContinuousCritic
+    critic_target: ContinuousCritic
+    reward_target: th.Tensor
+    return_std: th.Tensor
+    guidance_ready: th.Tensor
+
+    def __init__(
+        self,
+        observation_space: spaces.Space,
+        action_space: spaces.Box,
+        lr_schedule: Schedule,
+        net_arch: list[int] | dict[str, list[int]] | None = None,
+        activation_fn: str | type[nn.Module] = nn.ReLU,
+        features_extractor_class: type[BaseFeaturesExtractor] = FlattenExtractor,
+        features_extractor_kwargs: dict[str, Any] | None = None,
+        normalize_images: bool = True,
+        optimizer_class: type[th.optim.Optimizer] = th.optim.Adam,
+        optimizer_kwargs: dict[str, Any] | None = None,
+        n_critics: int = 2,
+        share_features_extractor: bool = False,
+        world_model_net_arch: list[int] | None = None,
+        diffusion_steps: int = 5,
+        noise_schedule: str = "vp",
+        sampler: str = "ddpm",
+        ddim_eta: float = 0.0,
+        guidance: str | None = "posterior",
+        guidance_covariance: str = "unit_gaussian",
+        guidance_target: str = "return",
+        guidance_scale: float | Sequence[float] = 1.0,
+        state_guidance_scale: float = 1.0,
+        outcome_guidance_scale: float = 1.0,
+        n_action_candidates: int = 10,
+        exploration_noise: float = 0.1,
+        discount: float = 0.99,
+    ) -> None:
+        super().__init__(
+            observation_space,
+            action_space,
+            features_extractor_class,
+            features_extractor_kwargs,
+            optimizer_class=optimizer_class,
+            optimizer_kwargs=optimizer_kwargs,
+            squash_output=True,
+            normalize_images=normalize_images,
+        )
+        if guidance_target not in GUIDANCE_TARGETS:
+            raise ValueError(f"Unknown guidance_target {guidance_target!r}: it must be one of {list(GUIDANCE_TARGETS)}")
+        if n_action_candidates < 1:
+            raise ValueError(f"n_action_candidates must be at least 1, got {n_action_candidates!r}")
+        if exploration_noise < 0.0:
+            raise ValueError(f"exploration_noise must be at least 0, got {exploration_noise!r}")
+        self.guidance_rule = None if guidance is None else GuidanceRule(guidance, guidance_covariance, guidance_scale)
+        self.guidance_kwargs: dict[str, Any] = {
+            "guidance": guidance,
+            "guidance_covariance": guidance_covariance,
+            "guidance_target": guidance_target,
+            "guidance_scale": guidance_scale,
+            "state_guidance_scale": state_guidance_scale,
+            "outcome_guidance_scale": outcome_guidance_scale,
+            "n_action_candidates": n_action_candidates,
+            "exploration_noise": exploration_noise,
+            "discount": discount,
+        }
+        self.guidance_target = guidance_target
+        self.state_guidance_scale = state_guidance_scale
+        self.outcome_guidance_scale = outcome_guidance_scale
+        self.n_action_candidates = n_action_candidates
+        self.exploration_noise = exploration_noise
+        self.discount = discount
+
+        self.net_arch = [256, 256] if net_arch is None else net_arch
+        self.activation_fn = activation_class(activation_fn)
+        self.n_critics = n_critics
+        self.share_features_extractor = share_features_extractor
+        self.world_model_net_arch = world_model_net_arch
+        actor_arch, critic_arch = get_actor_critic_arch(self.net_arch)
+        shared_kwargs = {
+            "observation_space": observation_space,
+            "action_space": action_space,
+            "activation_fn": self.activation_fn,
+            "normalize_images": normalize_images,
+        }
+        self.diffusion_kwargs = {
+            "diffusion_steps": diffusion_steps,
+            "noise_schedule": noise_schedule,
+            "sampler": sampler,
+            "ddim_eta": ddim_eta,
+        }
+        self.actor_kwargs = {**shared_kwargs, "net_arch": actor_arch, **self.diffusion_kwargs}
+        self.critic_kwargs = {
+            **shared_kwargs,
+            "net_arch": critic_arch,
+            "n_critics": n_critics,
+            "share_features_extractor": share_features_extractor,
+        }
+        self._build(lr_schedule)
+
+    def _build(self, lr_schedule: Schedule) -> None:
+        self.actor = self.make_actor()
+        self.actor_target = self.make_actor()
+        self.actor_target.load_state_dict(self.actor.state_dict())
+        # With a shared features extractor, targets share theirs too, see SB3's TD3Policy
+        shared = self.share_features_extractor
+        self.critic = self.make_critic(self.actor.features_extractor if shared else None)
+        self.critic_target = self.make_critic(self.actor_target.features_extractor if shared else None)
+        self.critic_target.load_state_dict(self.critic.state_dict())
+        self._check_guidance_steps()
+
+        self.has_image_state = any(is_image_space(space, normalized_image=not self.normalize_images) for space in _leaf_spaces(self.observation_space))
+        self.world_model = MaskedWorldModel(self._state_dim(), self.actor.action_dim, self.world_model_net_arch)
+        self.register_buffer("reward_target", th.zeros(()))
+        self.register_buffer("return_std", th.ones(()))
+        self.register_buffer("guidance_ready", th.zeros(()))
+        self.register_buffer("candidate_noise", self._fixed_candidate_noise(), persistent=False)
+
+        optimizer_kwargs = self.optimizer_kwargs
+        if self.optimizer_class in (th.optim.Adam, th.optim.AdamW):
+            # One kernel for all parameters: the update takes half the time
+            optimizer_kwargs = {"fused": True, **optimizer_kwargs}
+        for module in (self.actor, self.critic, self.world_model):
+            module.optimizer = self.optimizer_class(  # type: ignore[assignment]
+                module.parameters(),
+                lr=lr_schedule(1),  # type: ignore[call-arg]
+                **optimizer_kwargs,
+            )
+        self.actor_target.set_training_mode(False)
+        self.critic_target.set_training_mode(False)
+
+    def _check_guidance_steps(self) -> None:
+        n_steps = self.actor.schedule.n_steps
+        if self.guidance_rule is not None and len(self.guidance_rule.scales) not in (1, n_steps):
+            raise ValueError(
+                f"guidance_scale must be one number or one for each of the {n_steps} diffusion steps, "
+                f"got {len(self.guidance_rule.scales)} values"
+            )
+
+    def _fixed_candidate_noise(self) -> th.Tensor:
+        """Noise of deterministic predictions: none for the first candidate, the same at every call for the others."""
+        generator = th.Generator().manual_seed(0)
+        shape = (self.actor.schedule.n_steps, self.n_action_candidates, self.actor.action_dim)
+        noise = th.randn(shape, generator=generator)
+        noise[:, 0] = 0.0
+        return noise
+
+    def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> DiffusionActor:
+        return DiffusionActor(**self._update_features_extractor(self.actor_kwargs, features_extractor)).to(self.device)
+
+    def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> ContinuousCritic:
+        return ContinuousCritic(**self._update_features_extractor(self.critic_kwargs, features_extractor)).to(self.device)
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        data = super()._get_constructor_parameters()
+        data.update(
+            net_arch=self.net_arch,
+            activation_fn=self.activation_fn,
+            features_extractor_class=self.features_extractor_class,
+            features_extractor_kwargs=self.features_extractor_kwargs,
+            optimizer_class=self.optimizer_class,
+            optimizer_kwargs=self.optimizer_kwargs,
+            n_critics=self.n_critics,
+            share_features_extractor=self.share_features_extractor,
+            world_model_net_arch=self.world_model_net_arch,
+            lr_schedule=self._dummy_schedule,  # not needed for loading the policy alone
+            **self.diffusion_kwargs,
+            **self.guidance_kwargs,
+        )
+        return data
+
+    def set_training_mode(self, mode: bool) -> None:
+        """
+        Put the actor, the critics and the world model in training or evaluation mode; targets stay in evaluation mode.
+
+        :param mode: Whether to train
+        """
+        for module in (self.actor, self.critic, self.world_model):
+            module.train(mode)
+        self.training = mode
+
+    # The causal model's state -------------------------------------------------------------------------------------------
+
+    def _state_dim(self) -> int:
+        if self.has_image_state:
+            return self.critic_target.features_extractor.features_dim
+        return sum(spaces.flatdim(space) for space in _leaf_spaces(self.observation_space))
+
+    def state_names(self) -> tuple[str, ...]:
+        """
+        :return: Names of the causal model's state variables, by the observation space's keys and indices
+        """
+        if self.has_image_state:
+            return tuple(f"feature[{index}]" for index in range(self._state_dim()))
+        if isinstance(self.observation_space, spaces.Dict):
+            named = self.observation_space.spaces.items()
+        else:
+            named = {"obs": self.observation_space}.items()
+        return tuple(f"{name}[{index}]" for name, space in named for index in range(spaces.flatdim(space)))
+
+    @th.no_grad()
+    def causal_state(self, observation: PyTorchObs) -> th.Tensor:
+        """
+        The variables of the causal model: the observation flattened (discrete parts one-hot), or, where there are images, the
+        features of the target critic, through which no gradient flows.
+
+        :param observation: Observations as SB3 gives them to policies
+        :return: Shape ``(batch, n)``
+        """
+        if self.has_image_state:
+            return self.critic_target.extract_features(observation, self.critic_target.features_extractor)
+        preprocessed = preprocess_obs(observation, self.observation_space, normalize_images=self.normalize_images)
+        if isinstance(preprocessed, dict):
+            return th.cat([preprocessed[key].flatten(1) for key in self.observation_space.spaces], dim=1)  # type: ignore[attr-defined]
+        return preprocessed.flatten(1)
+
+    def _features_of_state(self, state: th.Tensor, extractor: nn.Module) -> th.Tensor:
+        """Features of predicted states, which have no observation: the inverse of :meth:`causal_state`."""
+        if not isinstance(self.observation_space, spaces.Dict):
+            return extractor(state.reshape(-1, *self.observation_space.shape) if _is_box(self.observation_space) else state)
+        parts, start = {}, 0
+        for key, space in self.observation_space.spaces.items():
+            size = spaces.flatdim(space)
+            part = state[:, start : start + size]
+            parts[key] = part.reshape(-1, *space.shape) if _is_box(space) else part  # type: ignore[misc]
+            start += size
+        return extractor(parts)
+
+    def value_gradient(self, state: th.Tensor, action: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """
+        The smallest target Q at a predicted state, and its gradient by the state.
+
+        :param state: Shape ``(batch, n)``
+        :param action: The action that follows, held fixed, shape ``(batch, d)``
+        :return: Shapes ``(batch,)`` and ``(batch, n)``, without a graph
+        """
+        with th.enable_grad():
+            state = state.detach().requires_grad_()
+            features = state if self.has_image_state else self._features_of_state(state, self.critic_target.features_extractor)
+            inputs = th.cat([features, action], dim=1)
+            value = th.cat([network(inputs) for network in self.critic_target.q_networks], dim=1).amin(dim=1)
+            (gradient,) = th.autograd.grad(value.sum(), state)
+        return value.detach(), gradient
+
+    # Guidance -----------------------------------------------------------------------------------------------------------
+
+    @property
+    def is_guided(self) -> bool:
+        """Whether samples are steered: the guidance is on and the causal graph has been found."""
+        return self.guidance_rule is not None and max(self.guidance_rule.scales) > 0.0 and bool(self.guidance_ready > 0.0)
+
+    def make_guidance(self, state: th.Tensor, next_state: th.Tensor, next_action: th.Tensor) -> CausalGuidance:
+        """
+        :param state: s, shape ``(batch, n)``
+        :param next_state: s* that is wished for, shape ``(batch, n)``
+        :param next_action: The action that would follow in s*, for the return target, shape ``(batch, d)``
+        :return: The guidance for these states
+        """
+        outcome: OutcomeTarget
+        if self.guidance_target == "return":
+            outcome = ReturnTarget(lambda predicted: self.value_gradient(predicted, next_action), self.discount, self.return_std)
+        else:
+            outcome = RewardTarget(self.reward_target)
+        return CausalGuidance(
+            self.world_model, state, next_state, outcome, self.state_guidance_scale, self.outcome_guidance_scale
+        )
+
+    def acting_guidance(self, state: th.Tensor, action: th.Tensor) -> LinearisedGuidance:
+        """
+        Guidance where the next state is not known: s* is the model's own prediction for an action, about which the guidance is
+        linear, so that the world model is evaluated once and not at every diffusion step.
+
+        :param state: s, shape ``(batch, n)``
+        :param action: The best candidate, shape ``(batch, d)``
+        :return: The guidance for these states
+        """
+        next_state, _ = self.world_model.predict_next_state(state, action)
+        next_action = action
+        if self.guidance_target == "return" and not self.has_image_state:
+            features = self._features_of_state(next_state, self.actor.features_extractor)
+            noise = th.zeros(self.actor.schedule.n_steps, *action.shape, dtype=action.dtype, device=action.device)
+            next_action = self.actor.sample(features, noise)
+        return LinearisedGuidance(self.make_guidance(state, next_state, next_action), action)
+
+    # Prediction ---------------------------------------------------------------------------------------------------------
+
+    def forward(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
+        return self._predict(observation, deterministic=deterministic)
+
+    def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
+        with th.no_grad():
+            action = self._act(observation, deterministic)
+            if not deterministic and self.exploration_noise > 0.0:
+                action = (action + self.exploration_noise * th.randn_like(action)).clamp(-1.0, 1.0)
+        return action
+
+    def _act(self, observation: PyTorchObs, deterministic: bool) -> th.Tensor:
+        features = self.actor.features(observation)
+        critic_features = self.critic_target.extract_features(observation, self.critic_target.features_extractor)
+        noise = self._candidate_noise(len(features), deterministic)
+        repeated = features.repeat_interleave(self.n_action_candidates, dim=0)
+        action = self._best_candidate(critic_features, self.actor.sample(repeated, noise))
+        if not self.is_guided:
+            return action
+        state = self.causal_state(observation)
+        guidance = self.acting_guidance(state, action)
+        return self.actor.sample(features, noise[:, :: self.n_action_candidates], guidance, self.guidance_rule)
+
+    def _candidate_noise(self, n_observations: int, deterministic: bool) -> th.Tensor:
+        if deterministic:
+            return self.candidate_noise.repeat(1, n_observations, 1)
+        n_steps, n_candidates, action_dim = self.candidate_noise.shape
+        return th.randn(n_steps, n_observations * n_candidates, action_dim, device=self.candidate_noise.device)
+
+    def _best_candidate(self, critic_features: th.Tensor, actions: th.Tensor) -> th.Tensor:
+        """The candidate with the largest of the smallest target Q, for each observation."""
+        n_candidates = len(actions) // len(critic_features)
+        if n_candidates == 1:
+            return actions
+        inputs = th.cat([critic_features.repeat_interleave(n_candidates, dim=0), actions], dim=1)
+        values = th.cat([network(inputs) for network in self.critic_target.q_networks], dim=1).amin(dim=1)
+        best = values.view(-1, n_candidates).argmax(dim=1)
+        return actions.view(-1, n_candidates, actions.shape[1])[th.arange(len(best), device=best.device), best]
+
+
+def _leaf_spaces(space: spaces.Space) -> list[spaces.Space]:
+    return list(space.spaces.values()) if isinstance(space, spaces.Dict) else [space]
+
+
+def _is_box(space: spaces.Space) -> bool:
+    return isinstance(space, spaces.Box)
+
+
+class CnnPolicy(CausalGDPPolicy):
+    """
+    Policy for images; see :class:`CausalGDPPolicy`.
+
+    :param args: Positional arguments of :class:`CausalGDPPolicy`
+    :param features_extractor_class: Features extractor to use
+    :param kwargs: Keyword arguments of :class:`CausalGDPPolicy`
+    """
+
+    def __init__(self, *args, features_extractor_class: type[BaseFeaturesExtractor] = NatureCNN, **kwargs) -> None:
+        super().__init__(*args, features_extractor_class=features_extractor_class, **kwargs)
+
+
+class MultiInputPolicy(CausalGDPPolicy):
+    """
+    Policy for dictionaries of observations; see :class:`CausalGDPPolicy`.
+
+    :param args: Positional arguments of :class:`CausalGDPPolicy`
+    :param features_extractor_class: Features extractor to use
+    :param kwargs: Keyword arguments of :class:`CausalGDPPolicy`
+    """
+
+    def __init__(self, *args, features_extractor_class: type[BaseFeaturesExtractor] = CombinedExtractor, **kwargs) -> None:
+        super().__init__(*args, features_extractor_class=features_extractor_class, **kwargs)
+
+
+MlpPolicy = CausalGDPPolicy
