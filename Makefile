@@ -1,5 +1,5 @@
 SHELL=/bin/bash
-LINT_PATHS=sb3_causalgdp/ tests/ examples/ $(wildcard benchmarks/*.py)
+LINT_PATHS=sb3_causalgdp/ tests/ examples/ benchmarks/
 
 pytest:
 	pytest -n 2 tests/

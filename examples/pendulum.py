@@ -24,7 +24,8 @@ if __name__ == "__main__":
     model = CausalGDP("MlpPolicy", "Pendulum-v1", seed=args.seed, verbose=0)
     model.learn(args.total_timesteps, progress_bar=True)
 
-    eval_env = make_vec_env("Pendulum-v1", seed=args.seed + 1_000)
+    # One episode in each environment: predictions are batched
+    eval_env = make_vec_env("Pendulum-v1", n_envs=20, seed=args.seed + 1_000)
     mean_return, std_return = evaluate_policy(model, eval_env, n_eval_episodes=20, deterministic=True)
 
     model_path = args.output_folder / "causalgdp_pendulum"

@@ -3,35 +3,33 @@
 import time
 import warnings
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 import torch as th
-from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
+from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_causalgdp.causal import make_discovery
 from sb3_causalgdp.diagnostics import guidance_divergence, step_size_bound
 
-if TYPE_CHECKING:
-    from sb3_causalgdp.causalgdp import CausalGDP
-
 
 class CausalWorldModelCallback(BaseCallback):
     """
-    Every ``refresh_freq`` environment steps: feed the new transitions to the moments, rediscover the causal graph and write its
-    masks into the world model.
+    Every ``refresh_freq`` environment steps: feed the new transitions to the moments, rediscover the causal graph and write
+    its masks into the world model.
 
-    :class:`~sb3_causalgdp.CausalGDP` adds one by itself; passing an own instance to ``learn()`` replaces it. The schedule and the
-    moments live on the model, so that they go on after ``save`` and ``load`` and with ``reset_num_timesteps=False``.
+    :class:`~sb3_causalgdp.CausalGDP` adds one by itself; passing an own instance to ``learn()`` replaces it. The schedule and
+    the moments live on the model, so that they go on after ``save`` and ``load`` and with ``reset_num_timesteps=False``.
 
     :param refresh_freq: Environment steps between refreshes, None for the model's ``causal_refresh_freq``
-    :param min_transitions: Transitions that are needed before the first discovery, None for ten for each cause (and 200 at least)
-    :param diagnostics_batch_size: Replay transitions on which the logged divergence and step-size bound are computed, 0 for none
+    :param min_transitions: Transitions that are needed before the first discovery, None for ten for each cause, 200 at least
+    :param diagnostics_batch_size: Replay transitions on which the logged divergence and step-size bound are computed, 0 for
+        none
     :param verbose: Verbosity level: 1 prints each refresh
     """
 
-    model: "CausalGDP"
+    model: Any  # a CausalGDP, whose file imports this one
     FEED_ROWS = 10_000
 
     def __init__(
@@ -94,8 +92,8 @@ class CausalWorldModelCallback(BaseCallback):
         if not self._said_too_few:
             self._said_too_few = True
             warnings.warn(
-                f"Causal discovery waits: it has {n_samples} transitions and needs {needed}. Until then every edge is open and "
-                "the policy is not guided."
+                f"Causal discovery waits: it has {n_samples} transitions and needs {needed}. Until then every edge is open "
+                "and the policy is not guided."
             )
 
     def _feed_moments(self) -> None:
@@ -116,19 +114,15 @@ class CausalWorldModelCallback(BaseCallback):
 
     def _read(self, buffer: ReplayBuffer, positions: np.ndarray) -> np.ndarray:
         """One-step transitions as rows ``[s, a, s', r]``, straight from the buffer's arrays, in the environment's units."""
-        following = (positions + 1) % buffer.buffer_size
-        if isinstance(buffer, DictReplayBuffer):
-            observations = {key: self._state_input(values[positions]) for key, values in buffer.observations.items()}
-            next_observations = {key: self._state_input(values[positions]) for key, values in buffer.next_observations.items()}
+        if buffer.optimize_memory_usage:
+            next_values, next_positions = buffer.observations, (positions + 1) % buffer.buffer_size
         else:
-            observations = self._state_input(buffer.observations[positions])
-            next_values = buffer.observations[following] if buffer.optimize_memory_usage else buffer.next_observations[positions]
-            next_observations = self._state_input(next_values)
+            next_values, next_positions = buffer.next_observations, positions
         actions = buffer.actions[positions].reshape(len(positions) * buffer.n_envs, -1)
         rows = self.model.transition_variables.stack(
-            self.model.policy.causal_state(observations).cpu().numpy(),
+            self._states(buffer.observations, positions),
             actions,
-            self.model.policy.causal_state(next_observations).cpu().numpy(),
+            self._states(next_values, next_positions),
             buffer.rewards[positions].reshape(-1),
         )
         if buffer.optimize_memory_usage:
@@ -136,8 +130,13 @@ class CausalWorldModelCallback(BaseCallback):
             rows = rows[buffer.dones[positions].reshape(-1) == 0.0]
         return rows
 
-    def _state_input(self, values: np.ndarray) -> th.Tensor:
-        return th.as_tensor(values.reshape(-1, *values.shape[2:]), device=self.model.device)
+    def _states(self, observations: np.ndarray | dict[str, np.ndarray], positions: np.ndarray) -> np.ndarray:
+        def rows(values: np.ndarray) -> th.Tensor:
+            return th.as_tensor(values[positions].reshape(-1, *values.shape[2:]), device=self.model.device)
+
+        if isinstance(observations, dict):
+            return self.model.policy.causal_state({key: rows(values) for key, values in observations.items()}).cpu().numpy()
+        return self.model.policy.causal_state(rows(observations)).cpu().numpy()
 
     def _log_diagnostics(self) -> None:
         model = self.model

@@ -1,6 +1,9 @@
 """CausalGDP: what happens when."""
 
+import io
 import math
+import os
+import pathlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, ClassVar, TypeVar
@@ -9,7 +12,7 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
-from stable_baselines3.common.callbacks import BaseCallback, CallbackList
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList, ConvertCallback
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy, ContinuousCritic
@@ -29,8 +32,8 @@ class CausalGDP(OffPolicyAlgorithm):
     """
     Causality-Guided Diffusion Policy (CausalGDP).
 
-    Paper: "CausalGDP: Causality-Guided Diffusion Policies for Reinforcement Learning" (Xiao, Hu, Ye and Yue). The actor, its loss
-    and the critics are those of Diffusion-QL (https://arxiv.org/abs/2208.06193); without guidance
+    Paper: "CausalGDP: Causality-Guided Diffusion Policies for Reinforcement Learning" (Xiao, Hu, Ye and Yue). The actor, its
+    loss and the critics are those of Diffusion-QL (https://arxiv.org/abs/2208.06193); without guidance
     (``guidance=None`` or ``guidance_scale=0``) the algorithm is Diffusion-QL.
 
     :param policy: The policy model to use (MlpPolicy, CnnPolicy, MultiInputPolicy)
@@ -52,8 +55,8 @@ class CausalGDP(OffPolicyAlgorithm):
         If ``None``, it will be automatically selected.
     :param replay_buffer_kwargs: Keyword arguments to pass to the replay buffer on creation.
     :param optimize_memory_usage: Enable a memory efficient variant of the replay buffer at a cost of more complexity.
-    :param n_steps: When n_step > 1, uses n-step return (with the NStepReplayBuffer) when updating the Q-value network; the world
-        model still learns from single steps.
+    :param n_steps: When n_step > 1, uses n-step return (with the NStepReplayBuffer) when updating the Q-value network; the
+        world model still learns from single steps.
     :param critic_learning_rate: Learning rate of the critics, a number or a schedule; None takes ``learning_rate``
     :param world_model_learning_rate: Learning rate of the world model, a number or a schedule
     :param eta: Weight of the Q term in the policy loss (the paper's table: 0.005 to 5)
@@ -69,8 +72,8 @@ class CausalGDP(OffPolicyAlgorithm):
     :param exploration_noise: Standard deviation of the Gaussian noise of non-deterministic predictions, for actions in [-1, 1]
     :param guidance: ``posterior`` (the gradient of log p(y | a^k), with the uncertainty of the clean action in it), ``score``
         (the paper's plain gradient), ``normalized`` (unit length), or None
-    :param guidance_target: What is wished for: ``return`` (one standard deviation of Q more than predicted) or ``reward`` (r*, the
-        running 0.99 quantile of the rewards)
+    :param guidance_target: What is wished for: ``return`` (one standard deviation of Q more than predicted) or ``reward`` (r*,
+        the running 0.99 quantile of the rewards)
     :param guidance_covariance: ``tweedie``, ``isotropic`` or ``unit_gaussian``, for ``guidance="posterior"``
     :param guidance_scale: lambda_k: one number, or one for each diffusion step from k = 1 to K
     :param state_guidance_scale: gamma_t of the paper, scales the precision of the next state
@@ -85,7 +88,8 @@ class CausalGDP(OffPolicyAlgorithm):
     :param tensorboard_log: The log location for tensorboard (if None, no logging)
     :param policy_kwargs: Additional arguments to be passed to the policy on creation, see
         :class:`~sb3_causalgdp.policies.CausalGDPPolicy`
-    :param verbose: Verbosity level: 0 for no output, 1 for info messages (such as device or wrappers used), 2 for debug messages
+    :param verbose: Verbosity level: 0 for no output, 1 for info messages (such as device or wrappers used), 2 for debug
+        messages
     :param seed: Seed for the pseudo random generators
     :param device: Device (cpu, cuda, ...) on which the code should be run.
         Setting it to auto, the code will be run on the GPU if possible.
@@ -270,16 +274,19 @@ class CausalGDP(OffPolicyAlgorithm):
         progress = self._current_progress_remaining
         critic_lr_schedule = self.critic_lr_schedule or self.lr_schedule
         update_learning_rate(self.critic.optimizer, critic_lr_schedule(progress))
-        update_learning_rate(self.world_model.optimizer, self.world_model_lr_schedule(progress))
+        update_learning_rate(_optimizer_of(self.world_model), self.world_model_lr_schedule(progress))
 
     def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
-        callback = super()._init_callback(callback, progress_bar)
-        if any(isinstance(one, CausalWorldModelCallback) for one in _flatten(callback)):
-            return callback
-        # In front of the others, so that evaluations and checkpoints see the new masks
-        callback = CallbackList([CausalWorldModelCallback(), callback])
-        callback.init_callback(self)
-        return callback
+        if callback is None:
+            callbacks: list[BaseCallback] = []
+        elif isinstance(callback, list):
+            callbacks = callback
+        else:
+            callbacks = [callback if isinstance(callback, BaseCallback) else ConvertCallback(callback)]
+        if not any(isinstance(one, CausalWorldModelCallback) for top in callbacks for one in _flatten(top)):
+            # In front of the others, so that evaluations and checkpoints see the new masks
+            callbacks = [CausalWorldModelCallback(), *callbacks]
+        return super()._init_callback(CallbackList(callbacks), progress_bar)
 
     def causal_graph(self) -> CausalGraph:
         """
@@ -380,9 +387,7 @@ class CausalGDP(OffPolicyAlgorithm):
                 self.policy.causal_state(replay_data.next_observations),
                 next_actions,
             )
-        denoising = denoising_loss(
-            self.actor.denoiser, self.actor.schedule, features, replay_data.actions, guidance, rule
-        )
+        denoising = denoising_loss(self.actor.denoiser, self.actor.schedule, features, replay_data.actions, guidance, rule)
         with _frozen(self.critic.q_networks):
             q_values = self.critic(replay_data.observations, self.actor.sample(features))
             q_term = q_loss(q_values, int(np.random.randint(len(q_values))))
@@ -391,7 +396,7 @@ class CausalGDP(OffPolicyAlgorithm):
         return {"actor_loss": loss.detach(), "denoising_loss": denoising.detach(), "q_loss": q_term.detach()}
 
     def _optimize(self, module: th.nn.Module, loss: th.Tensor) -> None:
-        optimizer: th.optim.Optimizer = module.optimizer  # type: ignore[assignment]
+        optimizer = _optimizer_of(module)
         optimizer.zero_grad()
         loss.backward()
         if self.max_grad_norm is not None and module is not self.world_model:
@@ -448,6 +453,33 @@ class CausalGDP(OffPolicyAlgorithm):
                 f"{np.atleast_1d(values)[tuple(where)]}. Nothing of this step was stored; see VecCheckNan to find its origin."
             )
 
+    def save(
+        self,
+        path: str | pathlib.Path | io.BufferedIOBase,
+        exclude: Iterable[str] | None = None,
+        include: Iterable[str] | None = None,
+    ) -> None:
+        """
+        Save all the attributes of the object and the model parameters in a zip-file; a file is replaced only once the new one
+        is complete.
+
+        :param path: Path to the file where the rl agent should be saved
+        :param exclude: Name of parameters that should be excluded in addition to the default ones
+        :param include: Name of parameters that might be excluded but should be included anyway
+        """
+        if not isinstance(path, (str, pathlib.Path)):
+            super().save(path, exclude, include)
+            return
+        target = pathlib.Path(path)
+        if target.suffix == "":
+            target = pathlib.Path(f"{path}.zip")
+        temporary = target.with_name(f".{os.getpid()}.{target.name}")
+        try:
+            super().save(temporary, exclude, include)
+            os.replace(temporary, target)
+        finally:
+            temporary.unlink(missing_ok=True)
+
     def _excluded_save_params(self) -> list[str]:
         return super()._excluded_save_params() + [  # noqa: RUF005
             "actor",
@@ -464,6 +496,12 @@ class CausalGDP(OffPolicyAlgorithm):
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         state_dicts = ["policy", "actor.optimizer", "critic.optimizer", "world_model.optimizer"]
         return state_dicts, []
+
+
+def _optimizer_of(module: th.nn.Module) -> th.optim.Optimizer:
+    optimizer = module.optimizer
+    assert isinstance(optimizer, th.optim.Optimizer)
+    return optimizer
 
 
 @contextmanager

@@ -42,7 +42,9 @@ def activation_class(activation_fn: str | type[nn.Module]) -> type[nn.Module]:
     if not isinstance(activation_fn, str):
         return activation_fn
     if activation_fn.lower() not in ACTIVATIONS:
-        raise ValueError(f"Unknown activation_fn {activation_fn!r}: it must be a torch.nn class or one of {sorted(ACTIVATIONS)}")
+        raise ValueError(
+            f"Unknown activation_fn {activation_fn!r}: it must be a torch.nn class or one of {sorted(ACTIVATIONS)}"
+        )
     return ACTIVATIONS[activation_fn.lower()]
 
 
@@ -160,7 +162,8 @@ class CausalGDPPolicy(BasePolicy):
     :param sampler: ``ddpm`` or ``ddim``
     :param ddim_eta: Noise of DDIM, in [0, 1]
     :param guidance: ``posterior``, ``score``, ``normalized``, or None for no guidance
-    :param guidance_covariance: ``tweedie``, ``isotropic`` or ``unit_gaussian``, see :class:`~sb3_causalgdp.diffusion.GuidanceRule`
+    :param guidance_covariance: ``tweedie``, ``isotropic`` or ``unit_gaussian``, see
+        :class:`~sb3_causalgdp.diffusion.GuidanceRule`
     :param guidance_target: ``return`` or ``reward``
     :param guidance_scale: lambda_k: one number, or one for each diffusion step
     :param state_guidance_scale: gamma, scales the precision of the next state
@@ -177,6 +180,7 @@ class CausalGDPPolicy(BasePolicy):
     reward_target: th.Tensor
     return_std: th.Tensor
     guidance_ready: th.Tensor
+    candidate_noise: th.Tensor
 
     def __init__(
         self,
@@ -280,7 +284,9 @@ class CausalGDPPolicy(BasePolicy):
         self.critic_target.load_state_dict(self.critic.state_dict())
         self._check_guidance_steps()
 
-        self.has_image_state = any(is_image_space(space, normalized_image=not self.normalize_images) for space in _leaf_spaces(self.observation_space))
+        self.has_image_state = any(
+            is_image_space(space, normalized_image=not self.normalize_images) for space in _leaf_spaces(self.observation_space)
+        )
         self.world_model = MaskedWorldModel(self._state_dim(), self.actor.action_dim, self.world_model_net_arch)
         self.register_buffer("reward_target", th.zeros(()))
         self.register_buffer("return_std", th.ones(()))
@@ -381,19 +387,20 @@ class CausalGDPPolicy(BasePolicy):
         if self.has_image_state:
             return self.critic_target.extract_features(observation, self.critic_target.features_extractor)
         preprocessed = preprocess_obs(observation, self.observation_space, normalize_images=self.normalize_images)
-        if isinstance(preprocessed, dict):
-            return th.cat([preprocessed[key].flatten(1) for key in self.observation_space.spaces], dim=1)  # type: ignore[attr-defined]
+        if isinstance(self.observation_space, spaces.Dict):
+            assert isinstance(preprocessed, dict)
+            return th.cat([preprocessed[key].flatten(1) for key in self.observation_space.spaces], dim=1)
+        assert isinstance(preprocessed, th.Tensor)
         return preprocessed.flatten(1)
 
     def _features_of_state(self, state: th.Tensor, extractor: nn.Module) -> th.Tensor:
         """Features of predicted states, which have no observation: the inverse of :meth:`causal_state`."""
         if not isinstance(self.observation_space, spaces.Dict):
-            return extractor(state.reshape(-1, *self.observation_space.shape) if _is_box(self.observation_space) else state)
+            return extractor(_as_observation(state, self.observation_space))
         parts, start = {}, 0
         for key, space in self.observation_space.spaces.items():
             size = spaces.flatdim(space)
-            part = state[:, start : start + size]
-            parts[key] = part.reshape(-1, *space.shape) if _is_box(space) else part  # type: ignore[misc]
+            parts[key] = _as_observation(state[:, start : start + size], space)
             start += size
         return extractor(parts)
 
@@ -429,7 +436,9 @@ class CausalGDPPolicy(BasePolicy):
         """
         outcome: OutcomeTarget
         if self.guidance_target == "return":
-            outcome = ReturnTarget(lambda predicted: self.value_gradient(predicted, next_action), self.discount, self.return_std)
+            outcome = ReturnTarget(
+                lambda predicted: self.value_gradient(predicted, next_action), self.discount, self.return_std
+            )
         else:
             outcome = RewardTarget(self.reward_target)
         return CausalGuidance(
@@ -498,34 +507,57 @@ def _leaf_spaces(space: spaces.Space) -> list[spaces.Space]:
     return list(space.spaces.values()) if isinstance(space, spaces.Dict) else [space]
 
 
-def _is_box(space: spaces.Space) -> bool:
-    return isinstance(space, spaces.Box)
+def _as_observation(state: th.Tensor, space: spaces.Space) -> th.Tensor:
+    """A box has its own shape; what is not a box has been preprocessed to a vector."""
+    return state.reshape(-1, *space.shape) if isinstance(space, spaces.Box) else state
 
 
 class CnnPolicy(CausalGDPPolicy):
     """
     Policy for images; see :class:`CausalGDPPolicy`.
 
-    :param args: Positional arguments of :class:`CausalGDPPolicy`
+    :param observation_space: Observation space
+    :param action_space: Action space
+    :param lr_schedule: Learning rate schedule
     :param features_extractor_class: Features extractor to use
     :param kwargs: Keyword arguments of :class:`CausalGDPPolicy`
     """
 
-    def __init__(self, *args, features_extractor_class: type[BaseFeaturesExtractor] = NatureCNN, **kwargs) -> None:
-        super().__init__(*args, features_extractor_class=features_extractor_class, **kwargs)
+    def __init__(
+        self,
+        observation_space: spaces.Space,
+        action_space: spaces.Box,
+        lr_schedule: Schedule,
+        features_extractor_class: type[BaseFeaturesExtractor] = NatureCNN,
+        **kwargs: Any,
+    ) -> None:
+        super().__init__(
+            observation_space, action_space, lr_schedule, features_extractor_class=features_extractor_class, **kwargs
+        )
 
 
 class MultiInputPolicy(CausalGDPPolicy):
     """
     Policy for dictionaries of observations; see :class:`CausalGDPPolicy`.
 
-    :param args: Positional arguments of :class:`CausalGDPPolicy`
+    :param observation_space: Observation space
+    :param action_space: Action space
+    :param lr_schedule: Learning rate schedule
     :param features_extractor_class: Features extractor to use
     :param kwargs: Keyword arguments of :class:`CausalGDPPolicy`
     """
 
-    def __init__(self, *args, features_extractor_class: type[BaseFeaturesExtractor] = CombinedExtractor, **kwargs) -> None:
-        super().__init__(*args, features_extractor_class=features_extractor_class, **kwargs)
+    def __init__(
+        self,
+        observation_space: spaces.Space,
+        action_space: spaces.Box,
+        lr_schedule: Schedule,
+        features_extractor_class: type[BaseFeaturesExtractor] = CombinedExtractor,
+        **kwargs: Any,
+    ) -> None:
+        super().__init__(
+            observation_space, action_space, lr_schedule, features_extractor_class=features_extractor_class, **kwargs
+        )
 
 
 MlpPolicy = CausalGDPPolicy

@@ -12,7 +12,7 @@ LAYERS = [
     {"__init__"},
     {"causalgdp"},
     {"callbacks"},
-    {"losses"},
+    {"losses", "diagnostics"},
     {"policies"},
     {"causal", "offline", "diffusion"},
 ]

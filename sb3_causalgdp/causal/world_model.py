@@ -12,9 +12,10 @@ class MaskedBlocks(nn.Module):
     """
     One small multi-layer perceptron per output, evaluated for all outputs at once.
 
-    Output j computes ``f_j(mask[j] * x)``. Masking the input of block j is masking its columns of the first layer, so that layer
-    is one dense product for all blocks, and the layers behind it are batched products of small matrices. Blocks share nothing:
-    the derivative of output j by an input whose mask is 0 is exactly 0, and one backward pass gives the Jacobian of all outputs.
+    Output j computes ``f_j(mask[j] * x)``. Masking the input of block j is masking its columns of the first layer, so that
+    layer is one dense product for all blocks, and the layers behind it are batched products of small matrices. Blocks share
+    nothing: the derivative of output j by an input whose mask is 0 is exactly 0, and one backward pass gives the Jacobian of
+    all outputs.
 
     :param n_inputs: Number of inputs p
     :param n_outputs: Number of outputs m
@@ -130,7 +131,9 @@ class MaskedWorldModel(nn.Module):
         super().__init__()
         net_arch = [128, 128, 128] if net_arch is None else list(net_arch)
         if not net_arch or len(set(net_arch)) > 1 or min(net_arch) < 1:
-            raise ValueError(f"world_model_net_arch must be a list of equal positive sizes, like [128, 128, 128], got {net_arch}")
+            raise ValueError(
+                f"world_model_net_arch must be a list of equal positive sizes, like [128, 128, 128], got {net_arch}"
+            )
         self.state_dim = state_dim
         self.action_dim = action_dim
         width, depth = net_arch[0], len(net_arch)

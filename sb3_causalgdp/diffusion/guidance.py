@@ -43,8 +43,8 @@ class GuidanceRule:
     :param mode: One of ``posterior``, ``score`` and ``normalized``
     :param covariance: What ``posterior`` takes for C_k and J_k. ``tweedie``: ``C_k = (1 - alpha_bar_k) / sqrt(alpha_bar_k)
         J_k`` with the Jacobian of the denoiser, exact for every prior (second-order Tweedie), d Jacobian-vector products of
-        the denoiser per step. ``isotropic``: ``C_k = (1 - alpha_bar_k) I``, with the denoiser's J_k. ``unit_gaussian``: both as
-        if the prior were N(0, I), ``J_k = sqrt(alpha_bar_k) I``: no Jacobian of the denoiser, the cheapest
+        the denoiser per step. ``isotropic``: ``C_k = (1 - alpha_bar_k) I``, with the denoiser's J_k. ``unit_gaussian``: both
+        as if the prior were N(0, I), ``J_k = sqrt(alpha_bar_k) I``: no Jacobian of the denoiser, the cheapest
     :param scale: lambda_k of the paper: one factor for all diffusion steps, or one for each, from k = 1 to K
     :raises ValueError: If a name is unknown, or the scale is negative or not finite
     """
@@ -110,7 +110,7 @@ class GuidanceRule:
 
 
 def _solve(system: th.Tensor, right_side: th.Tensor) -> th.Tensor:
-    """Solve ``(I + P C) x = v``, also where P is so large that rounding swallows the identity and the system turns singular."""
+    """Solve ``(I + P C) x = v``, also where P is so large that rounding swallows the identity, which leaves it singular."""
     identity = th.eye(system.shape[-1], dtype=system.dtype, device=system.device)
     size = system.abs().amax(dim=(1, 2), keepdim=True)
     system = system + 8.0 * th.finfo(system.dtype).eps * size * identity

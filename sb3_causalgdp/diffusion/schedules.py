@@ -126,6 +126,6 @@ class NoiseSchedule(nn.Module):
         :param step: Index of the diffusion step, ``0..K-1``, shape ``(batch,)``
         :return: Estimate of the clean action, shape ``(batch, d)``
         """
-        return (noisy_action - self.sqrt_one_minus_alpha_bar[step].unsqueeze(1) * noise) / self.sqrt_alpha_bar[
-            step
-        ].unsqueeze(1)
+        return (noisy_action - self.sqrt_one_minus_alpha_bar[step].unsqueeze(1) * noise) / self.sqrt_alpha_bar[step].unsqueeze(
+            1
+        )
