@@ -9,6 +9,7 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.type_aliases import PyTorchObs
 
 from sb3_causalgdp.causal import make_discovery
 from sb3_causalgdp.diagnostics import guidance_divergence, step_size_bound
@@ -31,6 +32,7 @@ class CausalWorldModelCallback(BaseCallback):
 
     model: Any  # a CausalGDP, whose file imports this one
     FEED_ROWS = 10_000
+    FEED_IMAGE_ROWS = 256
 
     def __init__(
         self,
@@ -47,6 +49,10 @@ class CausalWorldModelCallback(BaseCallback):
         self.diagnostics_batch_size = diagnostics_batch_size
         self._said_too_few = False
         self._said_step_size = False
+        self._counted_steps = 0
+
+    def _init_callback(self) -> None:
+        self._counted_steps = self.model.num_timesteps
 
     def _on_training_start(self) -> None:
         buffer = self.model.replay_buffer
@@ -56,7 +62,9 @@ class CausalWorldModelCallback(BaseCallback):
             self.model._moments_position = 0
 
     def _on_step(self) -> bool:
-        self.model._steps_since_refresh += self.training_env.num_envs
+        # By the model's counter: inside an event callback this is not called at every step
+        self.model._steps_since_refresh += self.model.num_timesteps - self._counted_steps
+        self._counted_steps = self.model.num_timesteps
         if self.model._steps_since_refresh >= (self.refresh_freq or self.model.causal_refresh_freq):
             self.refresh()
         return True
@@ -102,10 +110,12 @@ class CausalWorldModelCallback(BaseCallback):
         assert buffer is not None and self.model.causal_moments is not None
         end = buffer.pos
         n_rows = (end - self.model._moments_position) % buffer.buffer_size
-        if self.model._steps_since_refresh // buffer.n_envs > buffer.buffer_size:
+        if buffer.full and self.model._steps_since_refresh // buffer.n_envs >= buffer.buffer_size:
+            # The writing position has gone round once, or more
             n_rows = buffer.buffer_size
         positions = np.arange(end - n_rows, end) % buffer.buffer_size
-        rows_per_chunk = max(1, self.FEED_ROWS // buffer.n_envs)
+        chunk = self.FEED_IMAGE_ROWS if self.model.policy.has_image_state else self.FEED_ROWS
+        rows_per_chunk = max(1, chunk // buffer.n_envs)
         for first in range(0, n_rows, rows_per_chunk):
             rows = self._read(buffer, positions[first : first + rows_per_chunk])
             if len(rows) > 0:
@@ -138,15 +148,32 @@ class CausalWorldModelCallback(BaseCallback):
             return self.model.policy.causal_state({key: rows(values) for key, values in observations.items()}).cpu().numpy()
         return self.model.policy.causal_state(rows(observations)).cpu().numpy()
 
+    def _draw_observations(self, buffer: ReplayBuffer) -> PyTorchObs:
+        """A batch as the policy sees it, straight from the arrays: a HER buffer cannot sample before an episode has ended."""
+        rows = np.random.randint(buffer.size(), size=self.diagnostics_batch_size)
+        envs = np.random.randint(buffer.n_envs, size=self.diagnostics_batch_size)
+        drawn: np.ndarray | dict[str, np.ndarray]
+        if isinstance(buffer.observations, dict):
+            drawn = {key: values[rows, envs] for key, values in buffer.observations.items()}
+        else:
+            drawn = buffer.observations[rows, envs]
+        drawn = buffer._normalize_obs(drawn, self.model._vec_normalize_env)
+        if isinstance(drawn, dict):
+            return {key: buffer.to_torch(values) for key, values in drawn.items()}
+        return buffer.to_torch(drawn)
+
     def _log_diagnostics(self) -> None:
         model = self.model
         if self.diagnostics_batch_size == 0 or not model.policy.is_guided:
             return
         assert model.replay_buffer is not None
-        data = model.replay_buffer.sample(self.diagnostics_batch_size, env=model._vec_normalize_env)
+        if model.replay_buffer.size() == 0:
+            # A loaded model starts with an empty buffer
+            return
+        observations = self._draw_observations(model.replay_buffer)
         model.policy.set_training_mode(False)
-        self.logger.record("guidance/kl", guidance_divergence(model.policy, data.observations))
-        bound = step_size_bound(model.policy, data.observations)
+        self.logger.record("guidance/kl", guidance_divergence(model.policy, observations))
+        bound = step_size_bound(model.policy, observations)
         self.logger.record("guidance/step_size", bound.step_size)
         self.logger.record("guidance/step_size_bound", bound.bound)
         self.logger.record("guidance/lipschitz", bound.guidance_lipschitz)

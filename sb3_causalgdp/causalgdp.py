@@ -146,7 +146,7 @@ class CausalGDP(OffPolicyAlgorithm):
         guidance_target: str = "return",
         guidance_covariance: str = "unit_gaussian",
         guidance_scale: float | Sequence[float] = 1.0,
-        state_guidance_scale: float = 1.0,
+        state_guidance_scale: float = 0.01,
         outcome_guidance_scale: float = 1.0,
         causal_discovery: str | Callable[..., CausalGraph] = "notears",
         causal_discovery_kwargs: dict[str, Any] | None = None,
@@ -233,6 +233,7 @@ class CausalGDP(OffPolicyAlgorithm):
         if self.causal_moments is None:
             variables = self.transition_variables
             self.causal_moments = StreamingMoments(variables.n_variables, self.causal_half_life, variables.names)
+        self.causal_moments.half_life = self.causal_half_life  # load() may have changed it
         # Running mean and running var
         self.actor_batch_norm_stats = get_parameters_by_name(self.actor, ["running_"])
         self.critic_batch_norm_stats = get_parameters_by_name(self.critic, ["running_"])
@@ -268,6 +269,10 @@ class CausalGDP(OffPolicyAlgorithm):
         rate = self.critic_learning_rate
         self.critic_lr_schedule = None if rate is None else FloatSchedule(rate)
         self.world_model_lr_schedule = FloatSchedule(self.world_model_learning_rate)
+        own = {"critic_learning_rate": self.critic_lr_schedule, "world_model_learning_rate": self.world_model_lr_schedule}
+        for name, schedule in own.items():
+            if schedule is not None and not 0.0 <= schedule(1.0) < math.inf:
+                raise ValueError(f"{name} must be a finite number of at least 0, got {schedule(1.0)!r}")
 
     def _update_learning_rates(self) -> None:
         self._update_learning_rate(self.actor.optimizer)
@@ -283,7 +288,10 @@ class CausalGDP(OffPolicyAlgorithm):
             callbacks = callback
         else:
             callbacks = [callback if isinstance(callback, BaseCallback) else ConvertCallback(callback)]
-        if not any(isinstance(one, CausalWorldModelCallback) for top in callbacks for one in _flatten(top)):
+        n_own = sum(isinstance(one, CausalWorldModelCallback) for top in callbacks for one in _flatten(top))
+        if n_own > 1:
+            raise ValueError(f"At most one CausalWorldModelCallback can be passed, got {n_own}")
+        if n_own == 0:
             # In front of the others, so that evaluations and checkpoints see the new masks
             callbacks = [CausalWorldModelCallback(), *callbacks]
         return super()._init_callback(CallbackList(callbacks), progress_bar)
@@ -318,10 +326,14 @@ class CausalGDP(OffPolicyAlgorithm):
         for _ in range(gradient_steps):
             self._n_updates += 1
             replay_data = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)  # type: ignore[union-attr]
-            one_step = self._sample_one_step(batch_size) if self.n_steps > 1 else replay_data
+            one_step = replay_data
+            if isinstance(self.replay_buffer, NStepReplayBuffer):
+                one_step = self._sample_one_step(self.replay_buffer, batch_size)
             next_actions, step_losses = self._update_critics(replay_data)
             step_losses.update(self._update_world_model(one_step))
-            step_losses.update(self._update_actor(replay_data, one_step, next_actions))
+            if one_step is not replay_data:
+                next_actions = self._next_actions(one_step)
+            step_losses.update(self._update_actor(one_step, next_actions))
             self._update_targets()
             for name, loss in step_losses.items():
                 losses.setdefault(name, []).append(loss.item())
@@ -330,11 +342,14 @@ class CausalGDP(OffPolicyAlgorithm):
         for name, values in losses.items():
             self.logger.record(f"train/{name}", np.mean(values))
 
-    def _sample_one_step(self, batch_size: int):
+    def _sample_one_step(self, replay_buffer: NStepReplayBuffer, batch_size: int):
         # The n-step buffer gives n-step rewards and observations, which are wrong for a one-step world model
-        assert isinstance(self.replay_buffer, NStepReplayBuffer)
-        indices = np.random.randint(0, self.replay_buffer.size(), size=batch_size)
-        return ReplayBuffer._get_samples(self.replay_buffer, indices, env=self._vec_normalize_env)
+        indices = np.random.randint(0, replay_buffer.size(), size=batch_size)
+        return ReplayBuffer._get_samples(replay_buffer, indices, env=self._vec_normalize_env)
+
+    @th.no_grad()
+    def _next_actions(self, transitions) -> th.Tensor:
+        return self.actor_target.sample(self.actor_target.features(transitions.next_observations))
 
     def _update_critics(self, replay_data) -> tuple[th.Tensor, dict[str, th.Tensor]]:
         with th.no_grad():
@@ -372,24 +387,25 @@ class CausalGDP(OffPolicyAlgorithm):
             self.policy.reward_target.lerp_(quantile, self._running_weight())
         # The memory efficient buffer does not keep the last observation of an episode
         weight = 1.0 - transitions.dones.flatten() if self.optimize_memory_usage else None
-        self.world_model.update_statistics(state, next_state, rewards)
+        known = slice(None) if weight is None else weight > 0.0
+        self.world_model.update_statistics(state[known], next_state[known], rewards[known])
         transition, reward = world_model_loss(self.world_model, state, transitions.actions, next_state, rewards, weight)
         self._optimize(self.world_model, transition + reward)
         return {"world_model_transition_loss": transition.detach(), "world_model_reward_loss": reward.detach()}
 
-    def _update_actor(self, replay_data, one_step, next_actions: th.Tensor) -> dict[str, th.Tensor]:
-        features = self.actor.features(replay_data.observations)
+    def _update_actor(self, transitions, next_actions: th.Tensor) -> dict[str, th.Tensor]:
+        features = self.actor.features(transitions.observations)
         guidance = rule = None
         if self.policy.is_guided:
             rule = self.policy.guidance_rule
             guidance = self.policy.make_guidance(
-                self.policy.causal_state(replay_data.observations),
-                self.policy.causal_state(replay_data.next_observations),
+                self.policy.causal_state(transitions.observations),
+                self.policy.causal_state(transitions.next_observations),
                 next_actions,
             )
-        denoising = denoising_loss(self.actor.denoiser, self.actor.schedule, features, replay_data.actions, guidance, rule)
+        denoising = denoising_loss(self.actor.denoiser, self.actor.schedule, features, transitions.actions, guidance, rule)
         with _frozen(self.critic.q_networks):
-            q_values = self.critic(replay_data.observations, self.actor.sample(features))
+            q_values = self.critic(transitions.observations, self.actor.sample(features))
             q_term = q_loss(q_values, int(np.random.randint(len(q_values))))
             loss = self.denoising_weight * denoising + self.eta * q_term
             self._optimize(self.actor, loss)

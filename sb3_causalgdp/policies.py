@@ -1,5 +1,6 @@
 """Diffusion actor, double critics, their targets and the causal world model, as one SB3 policy."""
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -88,10 +89,27 @@ class DiffusionActor(BasePolicy):
         )
         check_sampler(sampler, ddim_eta)
         self.action_dim = get_action_dim(action_space)
+        self.net_arch = net_arch
+        self.features_dim = features_dim
+        self.activation_fn = activation_fn
         self.sampler = sampler
         self.ddim_eta = ddim_eta
         self.schedule = NoiseSchedule(noise_schedule, diffusion_steps)
         self.denoiser = MLPDenoiser(self.action_dim, features_dim, diffusion_steps, net_arch, activation_fn)
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        data = super()._get_constructor_parameters()
+        data.update(
+            net_arch=self.net_arch,
+            features_dim=self.features_dim,
+            activation_fn=self.activation_fn,
+            features_extractor=self.features_extractor,
+            diffusion_steps=self.schedule.n_steps,
+            noise_schedule=self.schedule.name,
+            sampler=self.sampler,
+            ddim_eta=self.ddim_eta,
+        )
+        return data
 
     def features(self, observation: PyTorchObs) -> th.Tensor:
         """
@@ -130,19 +148,21 @@ class DiffusionActor(BasePolicy):
             divergences=divergences,
         )
 
-    def forward(self, observation: PyTorchObs) -> th.Tensor:
-        return self.sample(self.features(observation))
+    def forward(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
+        features = self.features(observation)
+        shape = (self.schedule.n_steps, len(features), self.action_dim)
+        return self.sample(features, th.zeros(shape, device=features.device) if deterministic else None)
 
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
-        return self(observation)
+        return self(observation, deterministic)
 
 
 class CausalGDPPolicy(BasePolicy):
     """
     Policy of CausalGDP: diffusion actor, its moving average, critics, their targets and the masked world model.
 
-    Prediction draws candidate actions, imagines the next state of the best of them (by the smallest target Q), steers a second
-    pass of the sampler towards it and towards the outcome that is wished for, and plays the best of what comes out.
+    Prediction draws candidate actions, takes the best of them by the smallest target Q, imagines its next state, and runs the
+    sampler again from the same noise, steered towards that state and towards the outcome that is wished for.
 
     :param observation_space: Observation space
     :param action_space: Action space
@@ -205,7 +225,7 @@ class CausalGDPPolicy(BasePolicy):
         guidance_covariance: str = "unit_gaussian",
         guidance_target: str = "return",
         guidance_scale: float | Sequence[float] = 1.0,
-        state_guidance_scale: float = 1.0,
+        state_guidance_scale: float = 0.01,
         outcome_guidance_scale: float = 1.0,
         n_action_candidates: int = 10,
         exploration_noise: float = 0.1,
@@ -225,8 +245,13 @@ class CausalGDPPolicy(BasePolicy):
             raise ValueError(f"Unknown guidance_target {guidance_target!r}: it must be one of {list(GUIDANCE_TARGETS)}")
         if n_action_candidates < 1:
             raise ValueError(f"n_action_candidates must be at least 1, got {n_action_candidates!r}")
-        if exploration_noise < 0.0:
-            raise ValueError(f"exploration_noise must be at least 0, got {exploration_noise!r}")
+        for name, value in (
+            ("exploration_noise", exploration_noise),
+            ("state_guidance_scale", state_guidance_scale),
+            ("outcome_guidance_scale", outcome_guidance_scale),
+        ):
+            if not 0.0 <= value < math.inf:
+                raise ValueError(f"{name} must be a finite number of at least 0, got {value!r}")
         self.guidance_rule = None if guidance is None else GuidanceRule(guidance, guidance_covariance, guidance_scale)
         self.guidance_kwargs: dict[str, Any] = {
             "guidance": guidance,
@@ -294,7 +319,7 @@ class CausalGDPPolicy(BasePolicy):
         self.register_buffer("candidate_noise", self._fixed_candidate_noise(), persistent=False)
 
         optimizer_kwargs = self.optimizer_kwargs
-        if self.optimizer_class in (th.optim.Adam, th.optim.AdamW):
+        if self.optimizer_class in (th.optim.Adam, th.optim.AdamW) and "foreach" not in optimizer_kwargs:
             # One kernel for all parameters: the update takes half the time
             optimizer_kwargs = {"fused": True, **optimizer_kwargs}
         for module in (self.actor, self.critic, self.world_model):
@@ -373,7 +398,9 @@ class CausalGDPPolicy(BasePolicy):
             named = self.observation_space.spaces.items()
         else:
             named = {"obs": self.observation_space}.items()
-        return tuple(f"{name}[{index}]" for name, space in named for index in range(spaces.flatdim(space)))
+        # The key "action" would give the names of the actions
+        prefixes = ((f"obs[{name}]" if name == "action" else name, space) for name, space in named)
+        return tuple(f"{prefix}[{index}]" for prefix, space in prefixes for index in range(spaces.flatdim(space)))
 
     @th.no_grad()
     def causal_state(self, observation: PyTorchObs) -> th.Tensor:
@@ -478,13 +505,14 @@ class CausalGDPPolicy(BasePolicy):
         features = self.actor.features(observation)
         critic_features = self.critic_target.extract_features(observation, self.critic_target.features_extractor)
         noise = self._candidate_noise(len(features), deterministic)
-        repeated = features.repeat_interleave(self.n_action_candidates, dim=0)
-        action = self._best_candidate(critic_features, self.actor.sample(repeated, noise))
+        candidates = self.actor.sample(features.repeat_interleave(self.n_action_candidates, dim=0), noise)
+        best = self._best_candidate(critic_features, candidates)
+        action = candidates[best]
         if not self.is_guided:
             return action
-        state = self.causal_state(observation)
-        guidance = self.acting_guidance(state, action)
-        return self.actor.sample(features, noise[:, :: self.n_action_candidates], guidance, self.guidance_rule)
+        # From the same noise, the guided chain ends at the best candidate, moved by the guidance
+        guidance = self.acting_guidance(self.causal_state(observation), action)
+        return self.actor.sample(features, noise[:, best], guidance, self.guidance_rule)
 
     def _candidate_noise(self, n_observations: int, deterministic: bool) -> th.Tensor:
         if deterministic:
@@ -493,14 +521,14 @@ class CausalGDPPolicy(BasePolicy):
         return th.randn(n_steps, n_observations * n_candidates, action_dim, device=self.candidate_noise.device)
 
     def _best_candidate(self, critic_features: th.Tensor, actions: th.Tensor) -> th.Tensor:
-        """The candidate with the largest of the smallest target Q, for each observation."""
-        n_candidates = len(actions) // len(critic_features)
-        if n_candidates == 1:
-            return actions
+        """Row of the candidate with the largest of the smallest target Q, for each observation."""
+        first = th.arange(0, len(actions), self.n_action_candidates, device=actions.device)
+        if self.n_action_candidates == 1:
+            return first
+        n_candidates = self.n_action_candidates
         inputs = th.cat([critic_features.repeat_interleave(n_candidates, dim=0), actions], dim=1)
         values = th.cat([network(inputs) for network in self.critic_target.q_networks], dim=1).amin(dim=1)
-        best = values.view(-1, n_candidates).argmax(dim=1)
-        return actions.view(-1, n_candidates, actions.shape[1])[th.arange(len(best), device=best.device), best]
+        return first + values.view(-1, n_candidates).argmax(dim=1)
 
 
 def _leaf_spaces(space: spaces.Space) -> list[spaces.Space]:

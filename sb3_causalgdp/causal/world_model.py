@@ -42,9 +42,10 @@ class MaskedBlocks(nn.Module):
         return self.input_layer.weight * mask.repeat_interleave(self.width, dim=0)
 
     def _after_input_layer(self, hidden: th.Tensor) -> th.Tensor:
-        hidden = F.gelu(hidden).view(-1, self.n_outputs, self.width).transpose(0, 1)
+        # Smooth, as a Jacobian has to be, and cheaper than GELU or SiLU
+        hidden = th.tanh(hidden).view(-1, self.n_outputs, self.width).transpose(0, 1)
         for weight, bias in zip(self.hidden_weights, self.hidden_biases, strict=True):
-            hidden = F.gelu(th.baddbmm(bias, hidden, weight))
+            hidden = th.tanh(th.baddbmm(bias, hidden, weight))
         return th.einsum("jbw,jw->bj", hidden, self.output_weight) + self.output_bias
 
     def forward(self, inputs: th.Tensor, mask: th.Tensor) -> th.Tensor:
@@ -303,6 +304,7 @@ class MaskedWorldModel(nn.Module):
         reward, reward_gradient = self.reward.forward_and_jacobian(reward_inputs, self._reward_mask(), slice(None))
         reward_gradient = reward_gradient.squeeze(1)
         by_next_state, by_action = reward_gradient[:, : self.state_dim], reward_gradient[:, self.state_dim :]
+        by_next_state = by_next_state * (next_standardised.abs() <= self.INPUT_BOUND)
         total = by_action + th.einsum("bj,bji->bi", by_next_state, next_jacobian)
         return ActionResponse(
             next_state=self.state_mean + state_std * next_standardised,

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Sequence
 from typing import Protocol
 
+import numpy as np
 import torch as th
 
 from sb3_causalgdp.diffusion.schedules import NoiseSchedule
@@ -56,9 +57,12 @@ class GuidanceRule:
             raise ValueError(f"Unknown guidance mode {mode!r}: it must be one of {list(GUIDANCE_MODES)} or None")
         if covariance not in GUIDANCE_COVARIANCES:
             raise ValueError(f"Unknown guidance_covariance {covariance!r}: it must be one of {list(GUIDANCE_COVARIANCES)}")
-        scales = [float(scale)] if isinstance(scale, (int, float)) else [float(value) for value in scale]
-        if not scales or any(not 0.0 <= value < float("inf") for value in scales):
-            raise ValueError(f"guidance_scale must hold finite numbers of at least 0, got {scale!r}")
+        try:
+            scales = [float(value) for value in np.ravel(np.asarray(scale))]
+        except (TypeError, ValueError):
+            scales = []
+        if not scales or isinstance(scale, (str, bool)) or any(not 0.0 <= value < float("inf") for value in scales):
+            raise ValueError(f"guidance_scale must be a finite number of at least 0, or one for each step, got {scale!r}")
         self.mode = mode
         self.covariance = covariance
         self.scales = scales

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable
 
+import numpy as np
 import torch as th
 from torch import nn
 
@@ -85,10 +86,10 @@ class NoiseSchedule(nn.Module):
         super().__init__()
         if name not in NOISE_SCHEDULES:
             raise ValueError(f"Unknown noise_schedule {name!r}: it must be one of {sorted(NOISE_SCHEDULES)}")
-        if isinstance(n_steps, bool) or not isinstance(n_steps, int) or n_steps < 1:
+        if isinstance(n_steps, bool) or not isinstance(n_steps, (int, np.integer)) or n_steps < 1:
             raise ValueError(f"diffusion_steps must be an integer of at least 1, got {n_steps!r}")
         self.name = name
-        self.n_steps = n_steps
+        self.n_steps = int(n_steps)
         betas = NOISE_SCHEDULES[name](n_steps)
         alpha_bar = th.cumprod(1.0 - betas, dim=0)
         alpha_bar_previous = th.cat([th.ones(1, dtype=th.float64), alpha_bar[:-1]])

@@ -1,0 +1,190 @@
+import math
+
+import pytest
+import torch as th
+
+from sb3_causalgdp.causal import MaskedWorldModel
+from sb3_causalgdp.diffusion import GuidanceRule, NoiseSchedule
+from sb3_causalgdp.losses import critic_loss, denoising_loss, q_loss, td_target, world_model_loss
+
+SCHEDULE = NoiseSchedule("vp", 5)
+
+
+def column(*values):
+    return th.tensor(values).unsqueeze(1)
+
+
+# Critics ----------------------------------------------------------------------------------------------------------------
+
+
+def test_target_takes_the_smallest_of_the_critics():
+    # Each critic is the smallest once, so neither the first, nor the largest, nor the mean is right
+    next_q_values = [column(1.0, 5.0, 7.0), column(3.0, 2.0, 9.0), column(8.0, 4.0, 6.0)]
+    target = td_target(next_q_values, column(10.0, 20.0, 30.0), th.zeros(3, 1), 0.5)
+    th.testing.assert_close(target, column(10.5, 21.0, 33.0))
+
+
+def test_a_terminated_episode_does_not_bootstrap():
+    target = td_target([column(5.0, 5.0)], column(1.0, 2.0), column(1.0, 0.0), 0.9)
+    th.testing.assert_close(target, column(1.0, 6.5))
+
+
+def test_each_transition_may_have_its_own_discount():
+    target = td_target([column(10.0, 10.0)], column(1.0, 1.0), th.zeros(2, 1), column(0.9, 0.81))
+    th.testing.assert_close(target, column(10.0, 9.1))
+
+
+def test_each_critic_takes_its_best_action_before_the_smallest_critic_counts():
+    # Two states with three actions each, next to each other
+    first = column(1.0, 4.0, 2.0, 0.0, 0.0, 9.0)
+    second = column(6.0, 0.0, 3.0, 5.0, 1.0, 1.0)
+    target = td_target([first, second], th.zeros(2, 1), th.zeros(2, 1), 1.0, n_backup_actions=3)
+    # min over critics of max over actions; the max over actions of the min over critics would be 2 and 1
+    th.testing.assert_close(target, column(4.0, 5.0))
+
+
+def test_critic_loss_sums_the_mean_squared_errors():
+    q_values = [column(1.0, 2.0), column(0.0, 5.0)]
+    loss = critic_loss(q_values, column(2.0, 2.0))
+    assert loss.item() == pytest.approx((1.0 + 0.0) / 2 + (4.0 + 9.0) / 2)
+    assert critic_loss(q_values[:1], column(2.0, 2.0)).item() == pytest.approx(0.5)
+
+
+# Actor ------------------------------------------------------------------------------------------------------------------
+
+
+class PerfectDenoiser:
+    """Knows the clean action, which is its condition, and so the noise; keeps what it was asked."""
+
+    def __call__(self, noisy_action, step, condition):
+        alpha_bar = SCHEDULE.alpha_bar[step].unsqueeze(1)
+        self.noisy, self.step = noisy_action, step
+        self.noise = (noisy_action - alpha_bar.sqrt() * condition) / (1.0 - alpha_bar).sqrt()
+        return self.noise
+
+
+def pull(action):
+    """Constant gradient, no curvature."""
+    return th.tensor([2.0, -3.0]).expand_as(action), th.zeros(len(action), 2, 2)
+
+
+def test_a_perfect_denoiser_has_no_loss():
+    th.manual_seed(0)
+    actions = th.rand(64, 2) * 2 - 1
+    assert denoising_loss(PerfectDenoiser(), SCHEDULE, actions, actions).item() < 1e-8
+    assert denoising_loss(PerfectDenoiser(), SCHEDULE, actions, actions, None, GuidanceRule()).item() < 1e-8
+    assert denoising_loss(PerfectDenoiser(), SCHEDULE, actions, actions + 0.1).item() > 1e-3
+
+
+def test_the_noise_is_standard_normal_and_every_step_is_drawn():
+    th.manual_seed(0)
+    actions, denoiser = th.rand(20_000, 2) * 2 - 1, PerfectDenoiser()
+    denoising_loss(denoiser, SCHEDULE, actions, actions)
+    assert abs(denoiser.noise.mean().item()) < 0.03
+    assert denoiser.noise.std().item() == pytest.approx(1.0, abs=0.03)
+    assert th.bincount(denoiser.step, minlength=5).min() > 3_700 and len(th.bincount(denoiser.step)) == 5
+
+
+@pytest.mark.parametrize("scale", [0.5, [1.0, 2.0, 3.0, 4.0, 5.0]])
+def test_guidance_shifts_the_target(scale):
+    th.manual_seed(0)
+    actions, denoiser = th.rand(64, 2) * 2 - 1, PerfectDenoiser()
+    loss = denoising_loss(denoiser, SCHEDULE, actions, actions, pull, GuidanceRule("score", scale=scale))
+    scales = th.tensor(scale)[denoiser.step] if isinstance(scale, list) else th.full((64,), scale)
+    shift = (scales * (1.0 - SCHEDULE.alpha_bar[denoiser.step]).sqrt()).unsqueeze(1) * th.tensor([2.0, -3.0])
+    assert loss.item() == pytest.approx(shift.square().mean().item(), rel=1e-4)
+
+
+def test_guidance_shifts_the_target_towards_higher_density():
+    th.manual_seed(0)
+    actions = th.rand(64, 2) * 2 - 1
+
+    def shifted_denoiser(noisy, step, condition):
+        # eps - lambda sqrt(1 - alpha_bar) G is what has to be predicted
+        return PerfectDenoiser()(noisy, step, condition) - (1.0 - SCHEDULE.alpha_bar[step]).sqrt().unsqueeze(1) * th.tensor(
+            [2.0, -3.0]
+        )
+
+    assert denoising_loss(shifted_denoiser, SCHEDULE, actions, actions, pull, GuidanceRule("score")).item() < 1e-8
+
+
+def test_no_gradient_flows_through_the_guidance():
+    weight, pulled_to = th.tensor(0.7, requires_grad=True), th.tensor(2.0, requires_grad=True)
+    seen = {}
+
+    def denoiser(noisy, step, condition):
+        seen.update(noisy=noisy, step=step)
+        return weight * noisy
+
+    def guidance(action):
+        seen["clean"] = action.detach()
+        return pulled_to - action, th.eye(2).expand(len(action), 2, 2)
+
+    th.manual_seed(0)
+    actions = th.rand(64, 2) * 2 - 1
+    denoising_loss(denoiser, SCHEDULE, actions, actions, guidance, GuidanceRule("score")).backward()
+    alpha_bar = SCHEDULE.alpha_bar[seen["step"]].unsqueeze(1)
+    noise = (seen["noisy"] - alpha_bar.sqrt() * actions) / (1.0 - alpha_bar).sqrt()
+    target = noise - (1.0 - alpha_bar).sqrt() * (2.0 - seen["clean"])
+    expected = 2.0 * ((0.7 * seen["noisy"] - target) * seen["noisy"]).mean()
+    th.testing.assert_close(weight.grad, expected, rtol=1e-4, atol=1e-5)
+    assert pulled_to.grad is None
+
+
+def test_q_term_climbs_one_critic_on_the_scale_of_the_next():
+    q_values = [column(1.0, -3.0), column(10.0, 30.0), column(-4.0, 0.0)]
+    assert q_loss(q_values, 0).item() == pytest.approx(1.0 / 20.0)
+    assert q_loss(q_values, 1).item() == pytest.approx(-20.0 / 2.0)
+    assert q_loss(q_values, 2).item() == pytest.approx(2.0 / 2.0)
+
+
+def test_q_term_does_not_climb_by_its_scale():
+    q_values = [column(1.0, 3.0).requires_grad_(), column(10.0, 30.0).requires_grad_()]
+    q_loss(q_values, 0).backward()
+    th.testing.assert_close(q_values[0].grad, column(-0.5 / 20.0, -0.5 / 20.0))
+    assert q_values[1].grad is None
+
+
+def test_a_single_critic_is_its_own_scale():
+    q_values = [column(2.0, -6.0).requires_grad_()]
+    loss = q_loss(q_values, 0)
+    assert loss.item() == pytest.approx(0.5)
+    loss.backward()
+    th.testing.assert_close(q_values[0].grad, column(-0.125, -0.125))
+
+
+def test_critics_at_zero_give_a_finite_q_term():
+    assert math.isfinite(q_loss([column(1.0, 1.0), column(0.0, 0.0)], 0).item())
+
+
+# World model ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def transitions():
+    th.manual_seed(0)
+    model = MaskedWorldModel(3, 2, [8])
+    return model, th.randn(10, 3), th.rand(10, 2), th.randn(10, 3), th.randn(10)
+
+
+def test_world_model_loss_is_the_mean_likelihood(transitions):
+    model, *data = transitions
+    likelihood = model.negative_log_likelihood(*data)
+    for loss, terms in zip(world_model_loss(model, *data), likelihood, strict=True):
+        th.testing.assert_close(loss, terms.mean())
+
+
+def test_weights_of_zero_leave_transitions_out(transitions):
+    model, state, action, next_state, reward = transitions
+    weight = th.tensor([1.0, 0.0] * 5)
+    known = weight > 0.0
+    expected = world_model_loss(model, state[known], action[known], next_state[known], reward[known])
+    next_state[~known] = 1e4
+    losses = world_model_loss(model, state, action, next_state, reward, weight)
+    for ours, theirs in zip(losses, expected, strict=True):
+        th.testing.assert_close(ours, theirs)
+
+
+def test_weights_of_zero_alone_give_no_loss(transitions):
+    model, *data = transitions
+    assert [loss.item() for loss in world_model_loss(model, *data, weight=th.zeros(10))] == [0.0, 0.0]

@@ -1,0 +1,506 @@
+import inspect
+import io
+import json
+import os
+import subprocess
+import sys
+import zipfile
+from copy import deepcopy
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.logger import configure
+from stable_baselines3.common.noise import NormalActionNoise
+from torch import nn
+
+from sb3_causalgdp import CausalGDP, CausalWorldModelCallback
+from sb3_causalgdp.causal import CausalGraph, TransitionVariables
+
+KWARGS = {
+    "learning_starts": 50,
+    "batch_size": 16,
+    "train_freq": 4,
+    "buffer_size": 1000,
+    # Imitation more than ascent, or all actions would lie on their bounds and be the same for that reason
+    "eta": 0.01,
+    "denoising_weight": 1.0,
+    "causal_refresh_freq": 100,
+    "causal_half_life": 400.0,
+    "seed": 0,
+    "device": "cpu",
+    "policy_kwargs": {"net_arch": [16], "world_model_net_arch": [16, 16]},
+}
+
+
+class RecordingCallback(CausalWorldModelCallback):
+    """Keeps when it refreshed, and from how many transitions."""
+
+    def __init__(self):
+        super().__init__(min_transitions=50, diagnostics_batch_size=16)
+        self.refreshes = []
+
+    def refresh(self):
+        super().refresh()
+        self.refreshes.append((self.model.num_timesteps, self.model.causal_moments.n_samples))
+
+
+class PlaneEnv(gym.Env):
+    """Wants the actions to be small."""
+
+    def __init__(self, n_observations=3, n_actions=1):
+        self.observation_space = spaces.Box(-1.0, 1.0, (n_observations,))
+        self.action_space = spaces.Box(-1.0, 1.0, (n_actions,))
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return self.observation_space.sample(), {}
+
+    def step(self, action):
+        return self.observation_space.sample(), -float(np.square(action).sum()), False, False, {}
+
+
+def train(total_timesteps=250, **kwargs):
+    model = CausalGDP("MlpPolicy", "Pendulum-v1", **{**KWARGS, **kwargs})
+    return model.learn(total_timesteps, callback=RecordingCallback())
+
+
+@pytest.fixture(scope="module")
+def trained(observations):
+    model = train()
+    assert all(np.unique(actions).size > 6 for actions in predictions(model, observations))
+    return model
+
+
+@pytest.fixture(scope="module")
+def saved(trained, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("saved")
+    trained.save(folder / "model.zip")
+    trained.save_replay_buffer(folder / "buffer.pkl")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def observations():
+    angle = np.linspace(-3.0, 3.0, 12)
+    return np.stack([np.cos(angle), np.sin(angle), np.linspace(-4.0, 4.0, 12)], axis=1).astype(np.float32)
+
+
+def predictions(model, observations, seed=3):
+    deterministic, _ = model.predict(observations, deterministic=True)
+    th.manual_seed(seed)
+    stochastic, _ = model.predict(observations, deterministic=False)
+    return deterministic, stochastic
+
+
+def assert_same_predictions(model, other, observations):
+    for actions, others in zip(predictions(model, observations), predictions(other, observations), strict=True):
+        np.testing.assert_array_equal(actions, others)
+
+
+def assert_same_tree(tree, other):
+    """State dicts, lists and tensors, bit by bit."""
+    assert type(tree) is type(other)
+    if isinstance(tree, dict):
+        assert list(tree) == list(other)
+        for key, value in tree.items():
+            assert_same_tree(value, other[key])
+    elif isinstance(tree, (list, tuple)):
+        assert len(tree) == len(other)
+        for value, other_value in zip(tree, other, strict=True):
+            assert_same_tree(value, other_value)
+    elif isinstance(tree, th.Tensor):
+        assert tree.dtype == other.dtype and th.equal(tree, other)
+    else:
+        assert tree == other
+
+
+# The whole model --------------------------------------------------------------------------------------------------------
+
+
+def test_every_network_optimizer_and_buffer_survives(trained, saved):
+    loaded = CausalGDP.load(saved / "model.zip", device="cpu")
+    assert_same_tree(dict(trained.policy.state_dict()), dict(loaded.policy.state_dict()))
+    for name in ("actor", "critic", "world_model"):
+        state = getattr(trained, name).optimizer.state_dict()
+        assert any(values["exp_avg_sq"].any() for values in state["state"].values())
+        assert_same_tree(state, getattr(loaded, name).optimizer.state_dict())
+    for module in (loaded.policy.actor_target, loaded.policy.critic_target):
+        assert not module.training
+    # What was learned, not what a new model starts with
+    fresh = CausalGDP("MlpPolicy", "Pendulum-v1", **KWARGS).policy.state_dict()
+    for key in ("reward_target", "return_std", "guidance_ready", "world_model.state_mean", "world_model.n_batches"):
+        assert not th.equal(loaded.policy.state_dict()[key], fresh[key]), key
+
+
+def test_every_module_of_the_model_is_part_of_what_is_saved(trained):
+    names, _ = trained._get_torch_save_params()
+    modules = [value for value in vars(trained).values() if isinstance(value, nn.Module)]
+    known = {id(tensor) for tensor in (*trained.policy.parameters(), *trained.policy.buffers())}
+    for module in modules:
+        assert {id(tensor) for tensor in (*module.parameters(), *module.buffers())} <= known
+    optimizers = {
+        f"{name}.optimizer"
+        for name, module in trained.policy.named_modules()
+        if isinstance(vars(module).get("optimizer"), th.optim.Optimizer)
+    }
+    assert set(names) == {"policy"} | optimizers
+
+
+def test_what_is_known_of_the_causes_survives(trained, saved):
+    loaded = CausalGDP.load(saved / "model.zip", device="cpu")
+    assert loaded.causal_graph() == trained.causal_graph()
+    assert loaded.causal_graph().num_timesteps == 200
+    assert loaded.transition_variables == trained.transition_variables
+    moments, others = trained.causal_moments, loaded.causal_moments
+    for name in ("mean", "comoment", "count", "n_samples", "half_life", "names"):
+        np.testing.assert_array_equal(getattr(moments, name), getattr(others, name))
+    counters = ("num_timesteps", "_n_updates", "_steps_since_refresh", "_moments_position", "_episode_num")
+    for name in counters:
+        assert getattr(loaded, name) == getattr(trained, name), name
+    assert (loaded.num_timesteps, loaded._steps_since_refresh) == (252, 52)
+
+
+def test_predictions_survive_bit_by_bit(trained, saved, observations):
+    assert_same_predictions(trained, CausalGDP.load(saved / "model.zip", device="cpu"), observations)
+
+
+def test_a_loaded_model_trains_on_as_the_original_would(saved):
+    states = []
+    for _ in range(2):
+        original = CausalGDP.load(saved / "model.zip", env=gym.make("Pendulum-v1"), device="cpu")
+        original.load_replay_buffer(saved / "buffer.pkl")
+        original.set_logger(configure(None, []))
+        original.set_random_seed(5)
+        original.train(gradient_steps=2, batch_size=16)
+        copy = io.BytesIO()
+        original.save(copy)
+        loaded = CausalGDP.load(copy, env=gym.make("Pendulum-v1"), device="cpu")
+        loaded.load_replay_buffer(saved / "buffer.pkl")
+        loaded.set_logger(configure(None, []))
+        for model in (original, loaded):
+            model.set_random_seed(6)
+            model.train(gradient_steps=3, batch_size=16)
+            states.append(deepcopy(dict(model.policy.state_dict())))
+    for state in states[1:]:
+        assert_same_tree(states[0], state)
+
+
+ARGUMENTS = {
+    "learning_rate": 2e-3,
+    "buffer_size": 500,
+    "learning_starts": 7,
+    "batch_size": 32,
+    "tau": 0.01,
+    "gamma": 0.9,
+    "gradient_steps": 2,
+    "replay_buffer_class": ReplayBuffer,
+    "replay_buffer_kwargs": {"handle_timeout_termination": False},
+    "optimize_memory_usage": True,
+    "critic_learning_rate": 5e-4,
+    "world_model_learning_rate": 3e-4,
+    "eta": 0.5,
+    "denoising_weight": 0.7,
+    "max_q_backup": True,
+    "max_grad_norm": 3.0,
+    "diffusion_steps": 3,
+    "noise_schedule": "cosine",
+    "sampler": "ddim",
+    "ddim_eta": 0.5,
+    "n_action_candidates": 4,
+    "exploration_noise": 0.2,
+    "guidance": "score",
+    "guidance_target": "reward",
+    "guidance_covariance": "tweedie",
+    "guidance_scale": [0.1, 0.2, 0.3],
+    "state_guidance_scale": 0.4,
+    "outcome_guidance_scale": 0.6,
+    "causal_discovery_kwargs": {"sparsity": 0.05},
+    "causal_refresh_freq": 77,
+    "causal_half_life": 1234.0,
+    "tensorboard_log": "somewhere",
+    "policy_kwargs": {"net_arch": [8], "activation_fn": "tanh", "world_model_net_arch": [8]},
+    "verbose": 0,
+    "seed": 11,
+}
+
+
+def test_every_argument_is_an_attribute_and_survives():
+    model = CausalGDP("MlpPolicy", "Pendulum-v1", device="cpu", **ARGUMENTS)
+    stream = io.BytesIO()
+    model.save(stream)
+    loaded = CausalGDP.load(stream, device="cpu")
+    defaults = inspect.signature(CausalGDP.__init__).parameters
+    # SB3 keeps these in another form, and a custom buffer and n_steps exclude each other
+    elsewhere = {"self", "policy", "env", "train_freq", "action_noise", "stats_window_size", "device", "_init_setup_model"}
+    assert set(defaults) - elsewhere - set(ARGUMENTS) == {"n_steps", "causal_discovery"}
+    for name, value in ARGUMENTS.items():
+        assert value != defaults[name].default or name == "verbose"
+        assert getattr(model, name) == getattr(loaded, name) == value, name
+    policy = loaded.policy
+    assert (policy.actor.schedule.name, policy.actor.schedule.n_steps, policy.actor.sampler) == ("cosine", 3, "ddim")
+    assert (policy.discount, policy.n_action_candidates, policy.guidance_rule.scales) == (0.9, 4, [0.1, 0.2, 0.3])
+
+
+def test_schedules_and_noise_survive():
+    model = CausalGDP(
+        "MlpPolicy",
+        "Pendulum-v1",
+        learning_rate=lambda progress: 1e-3 * progress,
+        critic_learning_rate=lambda progress: 2e-3 * progress,
+        world_model_learning_rate=lambda progress: 3e-3 * progress,
+        action_noise=NormalActionNoise(np.zeros(1), 0.3 * np.ones(1)),
+        n_steps=3,
+        train_freq=(2, "episode"),
+        **{key: KWARGS[key] for key in ("buffer_size", "device", "policy_kwargs")},
+    )
+    stream = io.BytesIO()
+    model.save(stream)
+    with pytest.warns(UserWarning, match="n_steps=3"):
+        # SB3's words for a buffer class that it has chosen itself before it was saved
+        loaded = CausalGDP.load(stream, device="cpu")
+    rates = (loaded.lr_schedule(0.5), loaded.critic_lr_schedule(0.5), loaded.world_model_lr_schedule(0.5))
+    np.testing.assert_allclose(rates, [5e-4, 1e-3, 1.5e-3])
+    assert loaded.action_noise._sigma == pytest.approx(0.3)
+    assert loaded.train_freq.frequency == 2 and loaded.train_freq.unit.value == "episode"
+    assert loaded.n_steps == loaded.replay_buffer.n_steps == 3
+
+
+def test_a_file_like_object_and_a_name_without_suffix_work(trained, tmp_path, observations):
+    stream = io.BytesIO()
+    trained.save(stream)
+    assert_same_predictions(trained, CausalGDP.load(stream, device="cpu"), observations)
+    trained.save(str(tmp_path / "model"))
+    assert os.listdir(tmp_path) == ["model.zip"]
+    assert_same_predictions(trained, CausalGDP.load(tmp_path / "model", device="cpu"), observations)
+
+
+def test_a_save_that_fails_leaves_the_old_file(trained, tmp_path, observations):
+    class Unsaveable:
+        def __reduce__(self):
+            raise RuntimeError("cannot be saved")
+
+    model = CausalGDP.load(_bytes_of(trained), device="cpu")
+    model.save(tmp_path / "model.zip")
+    model.something = Unsaveable()
+    with pytest.raises(RuntimeError, match="cannot be saved"):
+        model.save(tmp_path / "model.zip")
+    assert os.listdir(tmp_path) == ["model.zip"]
+    assert_same_predictions(trained, CausalGDP.load(tmp_path / "model.zip", device="cpu"), observations)
+
+
+def _bytes_of(model):
+    stream = io.BytesIO()
+    model.save(stream)
+    return stream
+
+
+def test_a_saved_file_holds_neither_the_environment_nor_the_replay_buffer_nor_a_network_twice(saved):
+    with zipfile.ZipFile(saved / "model.zip") as archive:
+        names = archive.namelist()
+        data = json.loads(archive.read("data"))
+        for name in names:
+            if name.endswith("optimizer.pth") or name == "policy.pth":
+                assert th.load(io.BytesIO(archive.read(name)), weights_only=True)
+    for name in ("actor.optimizer.pth", "critic.optimizer.pth", "world_model.optimizer.pth", "policy.pth"):
+        assert name in names
+    left_out = {"env", "replay_buffer", "policy", "actor", "actor_target", "critic", "critic_target", "world_model"}
+    assert not left_out & set(data)
+
+
+def test_saving_while_training_is_possible(tmp_path):
+    class SavingCallback(CausalWorldModelCallback):
+        def _on_step(self):
+            if self.n_calls == 60:
+                self.model.save(tmp_path / "model.zip")
+            return super()._on_step()
+
+    CausalGDP("MlpPolicy", "Pendulum-v1", **KWARGS).learn(64, callback=SavingCallback())
+    assert CausalGDP.load(tmp_path / "model.zip", device="cpu").num_timesteps == 60
+
+
+# Another process, another time ------------------------------------------------------------------------------------------
+
+
+IN_A_NEW_PROCESS = """
+import sys
+import gymnasium as gym
+import numpy as np
+import torch as th
+from sb3_causalgdp import CausalGDP, CausalWorldModelCallback
+
+class RecordingCallback(CausalWorldModelCallback):
+    refreshes = []
+    def refresh(self):
+        super().refresh()
+        self.refreshes.append((self.model.num_timesteps, self.model.causal_moments.n_samples))
+
+th.set_num_threads(1)
+folder = sys.argv[1]
+observations = np.load(folder + "/observations.npy")
+model = CausalGDP.load(folder + "/model.zip", env=gym.make("Pendulum-v1"), device="cpu")
+deterministic, _ = model.predict(observations, deterministic=True)
+th.manual_seed(3)
+stochastic, _ = model.predict(observations, deterministic=False)
+model.load_replay_buffer(folder + "/buffer.pkl")
+model.learn(250, callback=RecordingCallback(min_transitions=50), reset_num_timesteps=False)
+np.savez(folder + "/result.npz", deterministic=deterministic, stochastic=stochastic, refreshes=RecordingCallback.refreshes)
+"""
+
+
+def test_a_new_process_predicts_the_same_and_goes_on_with_the_schedule(trained, saved, observations, tmp_path):
+    for name in ("model.zip", "buffer.pkl"):
+        os.link(saved / name, tmp_path / name)
+    np.save(tmp_path / "observations.npy", observations)
+    subprocess.run(
+        [sys.executable, "-c", IN_A_NEW_PROCESS, str(tmp_path)],
+        check=True,
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
+        timeout=120,
+    )
+    result = np.load(tmp_path / "result.npz")
+    deterministic, stochastic = predictions(trained, observations)
+    np.testing.assert_array_equal(result["deterministic"], deterministic)
+    np.testing.assert_array_equal(result["stochastic"], stochastic)
+    # As without interruption: refreshes every 100 steps, each from all that was stored by then
+    callback = RecordingCallback()
+    CausalGDP("MlpPolicy", "Pendulum-v1", **KWARGS).learn(502, callback=callback)
+    assert [refresh[0] for refresh in callback.refreshes] == [100, 200, 300, 400, 500]
+    assert result["refreshes"].tolist() == [list(refresh) for refresh in callback.refreshes[2:]]
+
+
+def test_without_the_replay_buffer_the_moments_go_on_from_what_they_know(saved):
+    model = CausalGDP.load(saved / "model.zip", env=gym.make("Pendulum-v1"), device="cpu")
+    known, callback = model.causal_moments.n_samples, RecordingCallback()
+    model.learn(250, callback=callback, reset_num_timesteps=False)
+    # 52 steps since the last refresh were in the buffer that was not loaded, and the last one is not stored yet
+    assert callback.refreshes == [(300, known + 47), (400, known + 147), (500, known + 247)]
+
+
+def test_a_refresh_that_is_due_at_once_needs_no_replay_buffer(saved):
+    model = CausalGDP.load(saved / "model.zip", env=gym.make("Pendulum-v1"), device="cpu")
+    model._steps_since_refresh, callback = 99, RecordingCallback()
+    model.learn(4, callback=callback, reset_num_timesteps=False)
+    assert [refresh[0] for refresh in callback.refreshes] == [253]
+
+
+def test_a_second_save_and_load_changes_nothing(saved, observations):
+    once = CausalGDP.load(saved / "model.zip", device="cpu")
+    twice = CausalGDP.load(_bytes_of(once), device="cpu")
+    assert_same_tree(dict(once.policy.state_dict()), dict(twice.policy.state_dict()))
+    assert once.causal_graph() == twice.causal_graph()
+    assert_same_predictions(once, twice, observations)
+
+
+def test_a_graph_written_by_hand_survives(saved):
+    model = CausalGDP.load(saved / "model.zip", device="cpu")
+    closed = CausalGraph.from_matrices(model.transition_variables, np.zeros((4, 4)), np.zeros((4, 4)), "by hand", 0)
+    model.set_causal_graph(closed)
+    loaded = CausalGDP.load(_bytes_of(model), device="cpu")
+    assert loaded.causal_graph() == closed
+    assert not loaded.world_model.state_to_state.any()
+
+
+# Loading with changes ---------------------------------------------------------------------------------------------------
+
+
+def test_a_model_loads_without_environment_and_for_another_number_of_environments(trained, saved, observations):
+    alone = CausalGDP.load(saved / "model.zip", device="cpu")
+    assert alone.env is None
+    assert_same_predictions(trained, alone, observations)
+    several = CausalGDP.load(saved / "model.zip", env=make_vec_env("Pendulum-v1", n_envs=3), device="cpu")
+    callback = RecordingCallback()
+    several.learn(60, callback=callback, reset_num_timesteps=False)
+    # 52 steps had passed, and 16 times three are the first that make it a hundred
+    assert [refresh[0] for refresh in callback.refreshes] == [300]
+
+
+def test_arguments_and_custom_objects_replace_what_was_saved(saved):
+    model = CausalGDP.load(
+        saved / "model.zip",
+        device="cpu",
+        custom_objects={"learning_rate": 2e-5, "unheard_of": 1.0},
+        eta=0.25,
+        gamma=0.5,
+        causal_half_life=77.0,
+        n_action_candidates=2,
+        guidance=None,
+    )
+    assert model.learning_rate == model.lr_schedule(1.0) == 2e-5
+    assert not hasattr(model, "unheard_of")
+    assert (model.eta, model.policy.discount, model.policy.n_action_candidates) == (0.25, 0.5, 2)
+    assert model.causal_half_life == model.causal_moments.half_life == 77.0
+    assert not model.policy.is_guided
+
+
+def test_excluded_and_included_attributes(trained):
+    stream = io.BytesIO()
+    trained.save(stream, exclude=["eta", "_causal_graph"], include=["replay_buffer"])
+    loaded = CausalGDP.load(stream, device="cpu", eta=9.0)
+    assert loaded.eta == 9.0
+    assert loaded.causal_graph().method == "none"
+    assert loaded.replay_buffer.pos == trained.replay_buffer.pos
+
+
+@pytest.mark.parametrize(
+    ("environment", "message"),
+    [
+        (PlaneEnv(n_observations=5), "Observation spaces do not match"),
+        (PlaneEnv(n_actions=2), "Observation spaces do not match|Action spaces do not match"),
+        ("MountainCarContinuous-v0", "Observation spaces do not match"),
+    ],
+)
+def test_another_environment_is_refused(saved, environment, message):
+    environment = gym.make(environment) if isinstance(environment, str) else environment
+    with pytest.raises(ValueError, match=message):
+        CausalGDP.load(saved / "model.zip", env=environment, device="cpu")
+
+
+def test_parameters_of_another_shape_are_refused(saved, tmp_path):
+    model = CausalGDP.load(saved / "model.zip", device="cpu")
+    wider = CausalGDP("MlpPolicy", "Pendulum-v1", **{**KWARGS, "policy_kwargs": {"net_arch": [8]}})
+    with pytest.raises(RuntimeError, match="size mismatch"):
+        model.set_parameters(wider.get_parameters())
+    with pytest.raises(ValueError, match="policy kwargs do not equal"):
+        CausalGDP.load(saved / "model.zip", device="cpu", policy_kwargs={"net_arch": [8]})
+    (tmp_path / "broken.zip").write_bytes((saved / "model.zip").read_bytes()[:1000])
+    with pytest.raises(ValueError, match="wasn't a zip-file"):
+        CausalGDP.load(tmp_path / "broken.zip", device="cpu")
+
+
+def test_a_graph_about_other_variables_is_refused(saved):
+    model = CausalGDP.load(saved / "model.zip", device="cpu")
+    graph = CausalGraph.fully_connected(TransitionVariables(("x",), ("a",)))
+    before = model.causal_graph()
+    with pytest.raises(ValueError, match="The graph is about"):
+        model.set_causal_graph(graph)
+    assert model.causal_graph() == before
+
+
+# The policy alone -------------------------------------------------------------------------------------------------------
+
+
+def test_the_policy_alone_predicts_the_same_with_its_guidance(trained, tmp_path, observations):
+    trained.policy.save(tmp_path / "policy.pth")
+    policy = type(trained.policy).load(tmp_path / "policy.pth", device="cpu")
+    assert policy.is_guided
+    assert_same_predictions(trained, policy, observations)
+    unguided = deepcopy(policy)
+    unguided.guidance_rule = None
+    assert not np.array_equal(predictions(unguided, observations)[0], predictions(policy, observations)[0])
+
+
+def test_the_actor_alone_predicts_the_same(trained, tmp_path, observations):
+    trained.actor.save(tmp_path / "actor.pth")
+    actor = type(trained.actor).load(tmp_path / "actor.pth", device="cpu")
+    assert_same_predictions(trained.actor, actor, observations)
+
+
+def test_policy_parameters_move_between_models(trained, observations):
+    other = CausalGDP("MlpPolicy", "Pendulum-v1", **{**KWARGS, "seed": 1})
+    other.set_parameters(trained.get_parameters())
+    assert_same_predictions(trained, other, observations)
