@@ -111,8 +111,8 @@ class CausalWorldModelCallback(BaseCallback):
         end = buffer.pos
         n_rows = (end - self.model._moments_position) % buffer.buffer_size
         if buffer.full and self.model._steps_since_refresh // buffer.n_envs >= buffer.buffer_size:
-            # The writing position has gone round once, or more
-            n_rows = buffer.buffer_size
+            # The writing position has gone round; the memory efficient buffer has overwritten its oldest observation
+            n_rows = buffer.buffer_size - int(buffer.optimize_memory_usage)
         positions = np.arange(end - n_rows, end) % buffer.buffer_size
         chunk = self.FEED_IMAGE_ROWS if self.model.policy.has_image_state else self.FEED_ROWS
         rows_per_chunk = max(1, chunk // buffer.n_envs)
@@ -177,9 +177,10 @@ class CausalWorldModelCallback(BaseCallback):
         self.logger.record("guidance/step_size", bound.step_size)
         self.logger.record("guidance/step_size_bound", bound.bound)
         self.logger.record("guidance/lipschitz", bound.guidance_lipschitz)
-        if bound.guidance_exceeds and not self._said_step_size:
+        too_steep = bound.guidance_exceeds and not model.policy.guidance_rule.samples_a_posterior
+        if too_steep and not self._said_step_size:
             self._said_step_size = True
             warnings.warn(
                 f"The guidance is too steep for the sampler's step of {bound.step_size:.3g} (Proposition 1): it alone allows "
-                f"{bound.guidance_bound:.3g}. Use guidance='posterior', a smaller guidance_scale or more diffusion_steps."
+                f"{bound.guidance_bound:.3g}. Use guidance='posterior' with a guidance_scale of at most 1, or more diffusion_steps."
             )

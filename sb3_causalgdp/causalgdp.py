@@ -269,8 +269,9 @@ class CausalGDP(OffPolicyAlgorithm):
         rate = self.critic_learning_rate
         self.critic_lr_schedule = None if rate is None else FloatSchedule(rate)
         self.world_model_lr_schedule = FloatSchedule(self.world_model_learning_rate)
-        own = {"critic_learning_rate": self.critic_lr_schedule, "world_model_learning_rate": self.world_model_lr_schedule}
-        for name, schedule in own.items():
+        schedules = (self.lr_schedule, self.critic_lr_schedule, self.world_model_lr_schedule)
+        names = ("learning_rate", "critic_learning_rate", "world_model_learning_rate")
+        for name, schedule in zip(names, schedules, strict=True):
             if schedule is not None and not 0.0 <= schedule(1.0) < math.inf:
                 raise ValueError(f"{name} must be a finite number of at least 0, got {schedule(1.0)!r}")
 

@@ -72,6 +72,11 @@ class GuidanceRule:
         """Whether the Jacobian of the denoiser is needed."""
         return self.mode == "posterior" and self.covariance != "unit_gaussian"
 
+    @property
+    def samples_a_posterior(self) -> bool:
+        """Whether the guided chain is that of a posterior, which asks for no smaller steps than the chain of the prior."""
+        return self.mode == "posterior" and max(self.scales) <= 1.0
+
     def scale_at(self, step: int | th.Tensor, reference: th.Tensor) -> th.Tensor:
         """
         :param step: Index of the diffusion step, ``0..K-1``: one, or shape ``(batch,)``
