@@ -182,5 +182,5 @@ class CausalWorldModelCallback(BaseCallback):
             self._said_step_size = True
             warnings.warn(
                 f"The guidance is too steep for the sampler's step of {bound.step_size:.3g} (Proposition 1): it alone allows "
-                f"{bound.guidance_bound:.3g}. Use guidance='posterior' with a guidance_scale of at most 1, or more diffusion_steps."
+                f"{bound.guidance_bound:.3g}. Use guidance='posterior', a guidance_scale up to 1, or more diffusion_steps."
             )
