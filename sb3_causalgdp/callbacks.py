@@ -79,9 +79,8 @@ class CausalWorldModelCallback(BaseCallback):
         model._steps_since_refresh = 0
         variables, moments = model.transition_variables, model.causal_moments
         assert moments is not None
-        needed = self.min_transitions
-        if needed is None:
-            needed = max(200, 10 * (variables.n_states + variables.n_actions))
+        n_causes = variables.n_states + variables.n_actions
+        needed = max(200, 10 * n_causes) if self.min_transitions is None else max(self.min_transitions, n_causes + 2)
         if moments.n_samples < needed:
             self._say_too_few(moments.n_samples, needed)
             return

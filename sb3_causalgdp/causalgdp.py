@@ -405,8 +405,11 @@ class CausalGDP(OffPolicyAlgorithm):
                 next_actions,
             )
         denoising = denoising_loss(self.actor.denoiser, self.actor.schedule, features, transitions.actions, guidance, rule)
+        with th.no_grad():
+            critic_features = self.critic.extract_features(transitions.observations, self.critic.features_extractor)
         with _frozen(self.critic.q_networks):
-            q_values = self.critic(transitions.observations, self.actor.sample(features))
+            inputs = th.cat([critic_features, self.actor.sample(features)], dim=1)
+            q_values = [network(inputs) for network in self.critic.q_networks]
             q_term = q_loss(q_values, int(np.random.randint(len(q_values))))
             loss = self.denoising_weight * denoising + self.eta * q_term
             self._optimize(self.actor, loss)
