@@ -23,7 +23,7 @@ from sb3_causalgdp.callbacks import CausalWorldModelCallback
 from sb3_causalgdp.causal import CausalGraph, StreamingMoments, TransitionVariables, make_discovery
 from sb3_causalgdp.causal.world_model import MaskedWorldModel
 from sb3_causalgdp.losses import critic_loss, denoising_loss, q_loss, td_target, world_model_loss
-from sb3_causalgdp.policies import CausalGDPPolicy, CnnPolicy, DiffusionActor, MlpPolicy, MultiInputPolicy
+from sb3_causalgdp.policies import CausalGDPPolicy, CnnPolicy, DiffusionActor, MlpPolicy, MultiInputPolicy, q_values
 
 SelfCausalGDP = TypeVar("SelfCausalGDP", bound="CausalGDP")
 
@@ -333,7 +333,8 @@ class CausalGDP(OffPolicyAlgorithm):
             next_actions, step_losses = self._update_critics(replay_data)
             step_losses.update(self._update_world_model(one_step))
             if one_step is not replay_data:
-                next_actions = self._next_actions(one_step)
+                with th.no_grad():
+                    next_actions = self.actor_target.sample(self.actor_target.features(one_step.next_observations))
             step_losses.update(self._update_actor(one_step, next_actions))
             self._update_targets()
             for name, loss in step_losses.items():
@@ -348,15 +349,10 @@ class CausalGDP(OffPolicyAlgorithm):
         indices = np.random.randint(0, replay_buffer.size(), size=batch_size)
         return ReplayBuffer._get_samples(replay_buffer, indices, env=self._vec_normalize_env)
 
-    @th.no_grad()
-    def _next_actions(self, transitions) -> th.Tensor:
-        return self.actor_target.sample(self.actor_target.features(transitions.next_observations))
-
     def _update_critics(self, replay_data) -> tuple[th.Tensor, dict[str, th.Tensor]]:
         with th.no_grad():
             next_actions, target = self._td_target(replay_data)
-        q_values = self.critic(replay_data.observations, replay_data.actions)
-        loss = critic_loss(q_values, target)
+        loss = critic_loss(self.critic(replay_data.observations, replay_data.actions), target)
         self._optimize(self.critic, loss)
         with th.no_grad():
             self.policy.return_std.lerp_(target.std(correction=0).clamp(min=1e-3), self._running_weight())
@@ -370,8 +366,7 @@ class CausalGDP(OffPolicyAlgorithm):
         actor_features = self.actor_target.features(next_observations).repeat_interleave(n_actions, dim=0)
         next_actions = self.actor_target.sample(actor_features)
         critic_features = self.critic_target.extract_features(next_observations, self.critic_target.features_extractor)
-        inputs = th.cat([critic_features.repeat_interleave(n_actions, dim=0), next_actions], dim=1)
-        next_q_values = [network(inputs) for network in self.critic_target.q_networks]
+        next_q_values = q_values(self.critic_target, critic_features.repeat_interleave(n_actions, dim=0), next_actions)
         target = td_target(next_q_values, replay_data.rewards, replay_data.dones, discounts, n_actions)
         return next_actions[::n_actions], target
 
@@ -408,9 +403,8 @@ class CausalGDP(OffPolicyAlgorithm):
         with th.no_grad():
             critic_features = self.critic.extract_features(transitions.observations, self.critic.features_extractor)
         with _frozen(self.critic.q_networks):
-            inputs = th.cat([critic_features, self.actor.sample(features)], dim=1)
-            q_values = [network(inputs) for network in self.critic.q_networks]
-            q_term = q_loss(q_values, int(np.random.randint(len(q_values))))
+            actor_q_values = q_values(self.critic, critic_features, self.actor.sample(features))
+            q_term = q_loss(actor_q_values, int(np.random.randint(len(actor_q_values))))
             loss = self.denoising_weight * denoising + self.eta * q_term
             self._optimize(self.actor, loss)
         return {"actor_loss": loss.detach(), "denoising_loss": denoising.detach(), "q_loss": q_term.detach()}

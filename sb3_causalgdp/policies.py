@@ -49,6 +49,19 @@ def activation_class(activation_fn: str | type[nn.Module]) -> type[nn.Module]:
     return ACTIVATIONS[activation_fn.lower()]
 
 
+def q_values(critic: ContinuousCritic, features: th.Tensor, actions: th.Tensor) -> list[th.Tensor]:
+    """
+    What each critic network says of features that are known already; the critic itself extracts them anew.
+
+    :param critic: The critics
+    :param features: Shape ``(batch, features_dim)``
+    :param actions: In [-1, 1], shape ``(batch, d)``
+    :return: One tensor of shape ``(batch, 1)`` for each network
+    """
+    inputs = th.cat([features, actions], dim=1)
+    return [network(inputs) for network in critic.q_networks]
+
+
 class DiffusionActor(BasePolicy):
     """
     Diffusion policy: denoises actions, conditioned on the features of the observation.
@@ -442,8 +455,7 @@ class CausalGDPPolicy(BasePolicy):
         with th.enable_grad():
             state = state.detach().requires_grad_()
             features = state if self.has_image_state else self._features_of_state(state, self.critic_target.features_extractor)
-            inputs = th.cat([features, action], dim=1)
-            value = th.cat([network(inputs) for network in self.critic_target.q_networks], dim=1).amin(dim=1)
+            value = th.cat(q_values(self.critic_target, features, action), dim=1).amin(dim=1)
             (gradient,) = th.autograd.grad(value.sum(), state)
         return value.detach(), gradient
 
@@ -526,8 +538,8 @@ class CausalGDPPolicy(BasePolicy):
         if self.n_action_candidates == 1:
             return first
         n_candidates = self.n_action_candidates
-        inputs = th.cat([critic_features.repeat_interleave(n_candidates, dim=0), actions], dim=1)
-        values = th.cat([network(inputs) for network in self.critic_target.q_networks], dim=1).amin(dim=1)
+        repeated = critic_features.repeat_interleave(n_candidates, dim=0)
+        values = th.cat(q_values(self.critic_target, repeated, actions), dim=1).amin(dim=1)
         return first + values.view(-1, n_candidates).argmax(dim=1)
 
 
