@@ -1,7 +1,8 @@
-"""The causal world model's schedule: every N environment steps, moments, discovery, masks."""
+"""The causal world model's schedule: every N environment steps, statistics, discovery, masks."""
 
 import time
 import warnings
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -11,13 +12,12 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.type_aliases import PyTorchObs
 
-from sb3_causalgdp.causal import make_discovery
 from sb3_causalgdp.diagnostics import guidance_divergence, step_size_bound
 
 
 class CausalWorldModelCallback(BaseCallback):
     """
-    Every ``refresh_freq`` environment steps: feed the new transitions to the moments, rediscover the causal graph and write
+    Every ``refresh_freq`` environment steps: feed the new transitions to the discovery's statistics, rediscover the causal graph and write
     its masks into the world model.
 
     :class:`~sb3_causalgdp.CausalGDP` adds one by itself; passing an own instance to ``learn()`` replaces it. The schedule and
@@ -33,6 +33,7 @@ class CausalWorldModelCallback(BaseCallback):
     model: Any  # a CausalGDP, whose file imports this one
     FEED_ROWS = 10_000
     FEED_IMAGE_ROWS = 256
+    HISTORY_ROWS = 20_000
 
     def __init__(
         self,
@@ -57,9 +58,9 @@ class CausalWorldModelCallback(BaseCallback):
     def _on_training_start(self) -> None:
         buffer = self.model.replay_buffer
         assert buffer is not None
-        if not buffer.full and self.model._moments_position > buffer.pos:
+        if not buffer.full and self.model._fed_position > buffer.pos:
             # A loaded model starts with an empty buffer
-            self.model._moments_position = 0
+            self.model._fed_position = 0
 
     def _on_step(self) -> bool:
         # By the model's counter: inside an event callback this is not called at every step
@@ -75,18 +76,18 @@ class CausalWorldModelCallback(BaseCallback):
         """
         model = self.model
         start = time.perf_counter()
-        self._feed_moments()
+        self._feed_statistics()
         model._steps_since_refresh = 0
-        variables, moments = model.transition_variables, model.causal_moments
-        assert moments is not None
+        variables, statistics = model.transition_variables, model.causal_statistics
         n_causes = variables.n_states + variables.n_actions
-        needed = max(200, 10 * n_causes) if self.min_transitions is None else max(self.min_transitions, n_causes + 2)
-        if moments.n_samples < needed:
-            self._say_too_few(moments.n_samples, needed)
+        wanted = max(200, 10 * n_causes) if self.min_transitions is None else self.min_transitions
+        needed = max(wanted, 2 * n_causes + 4)  # what any method needs
+        if statistics.n_samples < needed:
+            self._say_too_few(statistics.n_samples, needed)
             return
         before = model.causal_graph()
-        discover = make_discovery(model.causal_discovery, **model.causal_discovery_kwargs)
-        graph = replace(discover(moments, variables, model._causal_graph), num_timesteps=int(model.num_timesteps))
+        graph = model.discovery(statistics, variables, model._causal_graph)
+        graph = replace(graph, num_timesteps=int(model.num_timesteps))
         model.set_causal_graph(graph)
         self.logger.record("causal/n_edges", graph.n_edges)
         self.logger.record("causal/change", graph.change_since(before))
@@ -103,23 +104,35 @@ class CausalWorldModelCallback(BaseCallback):
                 "and the policy is not guided."
             )
 
-    def _feed_moments(self) -> None:
-        """Hand the moments the rows that were written to the replay buffer since the last time."""
+    def _feed_statistics(self) -> None:
+        """Hand the statistics the rows that were written to the replay buffer since the last time."""
         buffer = self.model.replay_buffer
-        assert buffer is not None and self.model.causal_moments is not None
-        end = buffer.pos
-        n_rows = (end - self.model._moments_position) % buffer.buffer_size
-        if buffer.full and self.model._steps_since_refresh // buffer.n_envs >= buffer.buffer_size:
-            # The writing position has gone round; the memory efficient buffer has overwritten its oldest observation
-            n_rows = buffer.buffer_size - int(buffer.optimize_memory_usage)
-        positions = np.arange(end - n_rows, end) % buffer.buffer_size
+        assert buffer is not None
+        n_rows = (buffer.pos - self.model._fed_position) % buffer.buffer_size
+        oldest = buffer.buffer_size if buffer.full else buffer.pos
+        if buffer.full:
+            # The memory efficient buffer has overwritten its oldest observation
+            oldest -= int(buffer.optimize_memory_usage)
+            if self.model._steps_since_refresh // buffer.n_envs >= buffer.buffer_size:
+                n_rows = oldest  # the writing position has gone round
+        statistics = self.model.causal_statistics
+        for rows in self._newest_rows(buffer, n_rows):
+            statistics.update(rows)
+        self.model._fed_position = buffer.pos
+        if getattr(statistics, "wants_history", False):
+            statistics.restart()
+            for rows in self._newest_rows(buffer, min(oldest, max(1, self.HISTORY_ROWS // buffer.n_envs))):
+                statistics.refill(rows)
+
+    def _newest_rows(self, buffer: ReplayBuffer, n_positions: int) -> Iterator[np.ndarray]:
+        """The transitions of the newest positions, oldest first, in parts that fit into memory."""
+        positions = np.arange(buffer.pos - n_positions, buffer.pos) % buffer.buffer_size
         chunk = self.FEED_IMAGE_ROWS if self.model.policy.has_image_state else self.FEED_ROWS
-        rows_per_chunk = max(1, chunk // buffer.n_envs)
-        for first in range(0, n_rows, rows_per_chunk):
-            rows = self._read(buffer, positions[first : first + rows_per_chunk])
+        positions_per_chunk = max(1, chunk // buffer.n_envs)
+        for first in range(0, n_positions, positions_per_chunk):
+            rows = self._read(buffer, positions[first : first + positions_per_chunk])
             if len(rows) > 0:
-                self.model.causal_moments.update(rows)
-        self.model._moments_position = end
+                yield rows
 
     def _read(self, buffer: ReplayBuffer, positions: np.ndarray) -> np.ndarray:
         """One-step transitions as rows ``[s, a, s', r]``, straight from the buffer's arrays, in the environment's units."""

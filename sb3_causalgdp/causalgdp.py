@@ -4,11 +4,12 @@ import io
 import math
 import os
 import pathlib
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
+import numpy.typing as npt
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
@@ -20,10 +21,22 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 from stable_baselines3.common.utils import FloatSchedule, get_parameters_by_name, polyak_update, update_learning_rate
 
 from sb3_causalgdp.callbacks import CausalWorldModelCallback
-from sb3_causalgdp.causal import CausalGraph, StreamingMoments, TransitionVariables, make_discovery
+from sb3_causalgdp.causal import (
+    ActionEffects,
+    CausalGraph,
+    Counterfactual,
+    InterventionalDistribution,
+    Statistics,
+    StructuralModel,
+    TransitionVariables,
+    make_discovery,
+    make_statistics,
+)
+from sb3_causalgdp.causal.interventions import ActionRule
 from sb3_causalgdp.causal.world_model import MaskedWorldModel
 from sb3_causalgdp.losses import critic_loss, denoising_loss, q_loss, td_target, world_model_loss
 from sb3_causalgdp.policies import CausalGDPPolicy, CnnPolicy, DiffusionActor, MlpPolicy, MultiInputPolicy, q_values
+from sb3_causalgdp.structural import StatePolicy, actions_of, make_structural_model, states_of
 
 SelfCausalGDP = TypeVar("SelfCausalGDP", bound="CausalGDP")
 
@@ -78,11 +91,14 @@ class CausalGDP(OffPolicyAlgorithm):
     :param guidance_scale: lambda_k: one number, or one for each diffusion step from k = 1 to K
     :param state_guidance_scale: gamma_t of the paper, scales the precision of the next state
     :param outcome_guidance_scale: beta_t of the paper, scales the precision of the reward or return
-    :param causal_discovery: Name of the discovery method (``notears``), or a callable like
+    :param causal_discovery: Name of the discovery method, a key of ``sb3_causalgdp.causal.DISCOVERY_METHODS``: ``partial_r2``
+        also finds what is nonlinear, ``notears`` is the paper's linear method; or a callable like
         :class:`~sb3_causalgdp.causal.discovery.DiscoveryMethod`
     :param causal_discovery_kwargs: Arguments of the named discovery method
     :param causal_refresh_freq: Rediscover the graph and rewrite the masks every so many environment steps
-    :param causal_half_life: Half-life, in transitions, of the moments from which the graph is found; None forgets nothing
+    :param causal_half_life: Half-life, in transitions, of the statistics from which the graph is found; None forgets nothing
+    :param causal_window: Number of newest transitions from which the graph is found (the paper's temporal window); None takes
+        all
     :param stats_window_size: Window size for the rollout logging, specifying the number of episodes to average
         the reported success rate, mean episode length, and mean reward over
     :param tensorboard_log: The log location for tensorboard (if None, no logging)
@@ -112,6 +128,7 @@ class CausalGDP(OffPolicyAlgorithm):
     RUNNING_WEIGHT = 0.01
     REWARD_QUANTILE = 0.99
     N_BACKUP_ACTIONS = 10
+    GRAPHS_IN_HISTORY = 32
 
     def __init__(
         self,
@@ -141,17 +158,18 @@ class CausalGDP(OffPolicyAlgorithm):
         sampler: str = "ddpm",
         ddim_eta: float = 0.0,
         n_action_candidates: int = 10,
-        exploration_noise: float = 0.1,
+        exploration_noise: float = 0.2,
         guidance: str | None = "posterior",
         guidance_target: str = "return",
         guidance_covariance: str = "unit_gaussian",
         guidance_scale: float | Sequence[float] = 1.0,
         state_guidance_scale: float = 0.01,
         outcome_guidance_scale: float = 1.0,
-        causal_discovery: str | Callable[..., CausalGraph] = "notears",
+        causal_discovery: str | Callable[..., CausalGraph] = "partial_r2",
         causal_discovery_kwargs: dict[str, Any] | None = None,
         causal_refresh_freq: int = 1_000,
         causal_half_life: float | None = None,
+        causal_window: int | None = None,
         stats_window_size: int = 100,
         tensorboard_log: str | None = None,
         policy_kwargs: dict[str, Any] | None = None,
@@ -208,11 +226,14 @@ class CausalGDP(OffPolicyAlgorithm):
         self.causal_discovery_kwargs = causal_discovery_kwargs or {}
         self.causal_refresh_freq = causal_refresh_freq
         self.causal_half_life = causal_half_life
+        self.causal_window = causal_window
         # What is known of the causal structure, saved with the model
-        self.causal_moments: StreamingMoments | None = None
+        self.causal_statistics: Statistics | None = None
+        self._statistics_made_by: tuple[Any, ...] | None = None
         self._causal_graph: CausalGraph | None = None
+        self.causal_graph_history: list[CausalGraph] = []
         self._steps_since_refresh = 0
-        self._moments_position = 0
+        self._fed_position = 0
 
         if _init_setup_model:
             self._setup_model()
@@ -227,18 +248,27 @@ class CausalGDP(OffPolicyAlgorithm):
         finally:
             self.policy_kwargs = policy_kwargs
         self._create_aliases()
-        make_discovery(self.causal_discovery, **self.causal_discovery_kwargs)
-        action_names = tuple(f"action[{index}]" for index in range(self.actor.action_dim))
-        self.transition_variables = TransitionVariables(self.policy.state_names(), action_names)
-        if self.causal_moments is None:
-            variables = self.transition_variables
-            self.causal_moments = StreamingMoments(variables.n_variables, self.causal_half_life, variables.names)
-        self.causal_moments.half_life = self.causal_half_life  # load() may have changed it
+        self._setup_discovery()
         # Running mean and running var
         self.actor_batch_norm_stats = get_parameters_by_name(self.actor, ["running_"])
         self.critic_batch_norm_stats = get_parameters_by_name(self.critic, ["running_"])
         self.actor_batch_norm_stats_target = get_parameters_by_name(self.actor_target, ["running_"])
         self.critic_batch_norm_stats_target = get_parameters_by_name(self.critic_target, ["running_"])
+
+    def _setup_discovery(self) -> None:
+        self.discovery = make_discovery(self.causal_discovery, **self.causal_discovery_kwargs)
+        action_names = tuple(f"action[{index}]" for index in range(self.actor.action_dim))
+        self.transition_variables = TransitionVariables(self.policy.state_names(), action_names)
+        method = self.causal_discovery
+        # A callable that was saved is not the same object when it is loaded
+        name = method if isinstance(method, str) else getattr(method, "__qualname__", type(method).__qualname__)
+        forgetting = (self.causal_half_life, self.causal_window)
+        made_by = (name, self.causal_discovery_kwargs, *forgetting)
+        if self.causal_statistics is None or self._statistics_made_by != made_by:
+            # Another method, which load() may have brought, gathers anew from the replay buffer
+            self.causal_statistics = make_statistics(self.discovery, self.transition_variables, *forgetting)
+            self._statistics_made_by = made_by
+            self._fed_position = 0
 
     def _check_arguments(self) -> None:
         for name in ("eta", "denoising_weight"):
@@ -305,7 +335,8 @@ class CausalGDP(OffPolicyAlgorithm):
 
     def set_causal_graph(self, graph: CausalGraph) -> None:
         """
-        Write a causal graph into the masks of the world model and let it steer the sampling.
+        Write a causal graph into the masks of the world model and let it steer the sampling. The graphs of up to 32 moments of
+        the training are in ``causal_graph_history``, which is saved on request: ``save(path, include=["causal_graph_history"])``.
 
         :param graph: The graph, on this model's variables
         :raises ValueError: If the graph is about other variables
@@ -318,6 +349,86 @@ class CausalGDP(OffPolicyAlgorithm):
         self.world_model.set_masks(*(th.as_tensor(mask, dtype=th.float32, device=self.device) for mask in masks))
         self.policy.guidance_ready.fill_(1.0)
         self._causal_graph = graph
+        self.causal_graph_history.append(graph)
+        if len(self.causal_graph_history) > self.GRAPHS_IN_HISTORY:
+            # Every second one goes, so that what is left spans the whole training; the newest stays
+            self.causal_graph_history = self.causal_graph_history[::-2][::-1]
+
+    def structural_model(self) -> StructuralModel:
+        """
+        The world model as a structural causal model in the environment's own units, on which interventions, effects and
+        counterfactuals are computed.
+
+        With ``VecNormalize``, set its environment first (``set_env``): the model's statistics are read from it.
+
+        :return: The structural model; later training changes its answers
+        :raises RuntimeError: If the world model has not been trained
+        """
+        return make_structural_model(self.policy, self.transition_variables, self._vec_normalize_env)
+
+    def intervene(
+        self,
+        observation: np.ndarray | dict[str, np.ndarray],
+        action: npt.ArrayLike,
+        interventions: Mapping[str, npt.ArrayLike],
+        n_samples: int | None = None,
+    ) -> InterventionalDistribution:
+        """
+        The distribution of the next state and of the reward under do(...), like
+        ``model.intervene(obs, action, {"action[0]": 0.5, "obs[3]'": 1.0})``.
+
+        :param observation: One observation or a batch, as the environment gives it: not normalised by ``VecNormalize``
+        :param action: The action of each, within the bounds of the action space
+        :param interventions: Values by name (see ``model.transition_variables.names``), in the environment's units
+        :param n_samples: Samples of the next state for the reward's uncertainty, None for the delta method
+        :return: See :meth:`~sb3_causalgdp.causal.StructuralModel.intervene`
+        """
+        model = self.structural_model()
+        return model.intervene(self._states_of(observation), actions_of(self.policy, action), interventions, n_samples)
+
+    def effect_of_actions(
+        self,
+        observations: np.ndarray | dict[str, np.ndarray],
+        actions: npt.ArrayLike,
+        delta: npt.ArrayLike | None = None,
+    ) -> ActionEffects:
+        """
+        How strongly each action component moves the reward, direct and through the next state, and each next state variable.
+
+        :param observations: A batch of observations, as the environment gives them: not normalised by ``VecNormalize``
+        :param actions: The action of each, within the bounds of the action space
+        :param delta: Change of the action, in the environment's units; None for the derivative
+        :return: Averages over the observations, see :meth:`~sb3_causalgdp.causal.StructuralModel.effect_of_actions`
+        """
+        model = self.structural_model()
+        return model.effect_of_actions(self._states_of(observations), actions_of(self.policy, actions), delta)
+
+    def counterfactual(
+        self,
+        trajectory: tuple[Any, npt.ArrayLike, npt.ArrayLike],
+        changes: Mapping[str, npt.ArrayLike | ActionRule],
+        follow_policy: bool = False,
+    ) -> Counterfactual:
+        """
+        What would have happened in a recorded episode had other actions been taken, under the same noise, like
+        ``model.counterfactual((observations, actions, rewards), {"action[0]": 0.0})``.
+
+        :param trajectory: T + 1 observations, T actions and T rewards of one episode, as the environment gives them: not
+            normalised by ``VecNormalize``
+        :param changes: For each changed action component a number, T values or a function, see
+            :meth:`~sb3_causalgdp.causal.StructuralModel.counterfactual`
+        :param follow_policy: Whether this model's policy reacts to the counterfactual states with the components that are not
+            changed, its deviation from the recorded actions being replayed; by default they stay as recorded
+        :return: States, actions, rewards and noise, in the environment's units
+        """
+        model = self.structural_model()
+        observations, actions, rewards = trajectory
+        recorded = (self._states_of(observations), actions_of(self.policy, actions), rewards)
+        policy = StatePolicy(self.policy, self._vec_normalize_env) if follow_policy else None
+        return model.counterfactual(recorded, changes, policy)
+
+    def _states_of(self, observation: Any) -> np.ndarray:
+        return states_of(self.policy, observation, self._vec_normalize_env)
 
     def train(self, gradient_steps: int, batch_size: int = 256) -> None:
         # Switch to train mode (this affects batch norm / dropout)
@@ -501,6 +612,8 @@ class CausalGDP(OffPolicyAlgorithm):
             "critic",
             "critic_target",
             "world_model",
+            "discovery",
+            "causal_graph_history",
             "actor_batch_norm_stats",
             "critic_batch_norm_stats",
             "actor_batch_norm_stats_target",

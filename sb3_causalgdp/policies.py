@@ -241,7 +241,7 @@ class CausalGDPPolicy(BasePolicy):
         state_guidance_scale: float = 0.01,
         outcome_guidance_scale: float = 1.0,
         n_action_candidates: int = 10,
-        exploration_noise: float = 0.1,
+        exploration_noise: float = 0.2,
         discount: float = 0.99,
     ) -> None:
         super().__init__(

@@ -1,5 +1,6 @@
 import os
 import warnings
+from dataclasses import replace
 
 import gymnasium as gym
 import numpy as np
@@ -133,7 +134,7 @@ def test_other_callbacks_are_set_up_once_and_see_the_new_masks():
 def all_open(moments, variables, previous=None):
     assert isinstance(moments, StreamingMoments)
     shape = (variables.n_states + 1, variables.n_states + variables.n_actions)
-    return CausalGraph.from_matrices(variables, np.ones(shape), np.zeros(shape), "all open", moments.n_samples)
+    return CausalGraph(variables, np.ones(shape), np.zeros(shape), "all open", moments.n_samples)
 
 
 # Schedule ---------------------------------------------------------------------------------------------------------------
@@ -163,7 +164,7 @@ def test_the_schedule_goes_on_over_several_calls():
     model.learn(50, callback=callback)
     assert callback.refreshes == [30]
     # Every transition counts once: 150 of before, 29 of now
-    assert model.causal_moments.n_samples == 179
+    assert model.causal_statistics.n_samples == 179
 
 
 def test_in_an_event_callback_the_steps_between_the_events_count():
@@ -182,7 +183,7 @@ def test_an_own_discovery_method_sees_moments_and_the_last_graph_and_its_masks_a
     def discover(moments, variables, previous=None):
         calls.append((moments.n_samples, previous))
         masks = np.full((variables.n_states + 1, variables.n_states + variables.n_actions), 0.25 * len(calls))
-        return CausalGraph.from_matrices(variables, masks, np.zeros_like(masks), "own", moments.n_samples)
+        return CausalGraph(variables, masks, np.zeros_like(masks), "own", moments.n_samples)
 
     model = make(causal_discovery=discover)
     model.learn(128, callback=RecordingCallback())
@@ -195,9 +196,9 @@ def test_an_own_discovery_method_sees_moments_and_the_last_graph_and_its_masks_a
 def test_a_half_life_makes_old_transitions_weigh_less():
     model = make(causal_half_life=20.0)
     model.learn(128, callback=RecordingCallback())
-    moments = model.causal_moments
-    assert moments.n_samples == 119
-    assert 20.0 < moments.count < 80.0
+    statistics = model.causal_statistics
+    assert statistics.n_samples == 119
+    assert 20.0 < statistics.raw.count < 80.0
 
 
 def test_a_refresh_by_hand():
@@ -208,7 +209,7 @@ def test_a_refresh_by_hand():
     callback.refresh()
     assert model.causal_graph().n_samples == 48 and model.policy.is_guided
     callback.refresh()
-    assert model.causal_moments.n_samples == 48
+    assert model.causal_statistics.n_samples == 48
 
 
 # What is logged ---------------------------------------------------------------------------------------------------------
@@ -337,3 +338,14 @@ def test_guidance_that_is_too_steep_for_the_sampler_is_said_once(kwargs, warned)
         warnings.simplefilter("always")
         model.learn(170, callback=CausalWorldModelCallback(min_transitions=40))
     assert sum("Proposition 1" in str(one.message) for one in caught) == int(warned)
+
+
+def test_the_history_spans_the_training_in_a_bounded_number_of_graphs():
+    model = make()
+    graphs = [replace(model.causal_graph(), method=str(i)) for i in range(200)]
+    for graph in graphs:
+        model.set_causal_graph(graph)
+    history = [int(graph.method) for graph in model.causal_graph_history]
+    assert len(history) <= model.GRAPHS_IN_HISTORY
+    assert history[-1] == 199 and history[0] == 0 and history == sorted(history)
+    assert "causal_graph_history" in model._excluded_save_params()

@@ -12,7 +12,7 @@ LAYERS = [
     {"__init__"},
     {"causalgdp"},
     {"callbacks"},
-    {"losses", "diagnostics"},
+    {"losses", "diagnostics", "structural"},
     {"policies"},
     {"causal", "offline", "diffusion"},
 ]

@@ -30,7 +30,7 @@ class RecordingCallback(CausalWorldModelCallback):
     def refresh(self):
         super().refresh()
         model = self.model
-        n_samples = (model.causal_moments.n_samples, model.causal_graph().n_samples)
+        n_samples = (model.causal_statistics.n_samples, model.causal_graph().n_samples)
         self.refreshes.append((model.num_timesteps, *n_samples, model.replay_buffer.size()))
 
 
@@ -42,7 +42,8 @@ def learn(total_timesteps, callback=None, **kwargs):
 @pytest.fixture(scope="module")
 def trained():
     callback = RecordingCallback()
-    return learn(310, callback), callback
+    # In Pendulum nearly everything causes everything: the linear method leaves some edges out
+    return learn(310, callback, causal_discovery="notears"), callback
 
 
 @pytest.fixture(scope="module")
@@ -168,11 +169,11 @@ def test_refreshes_come_on_time_and_use_every_transition(trained):
 def test_moments_are_those_of_the_replay_buffer(trained):
     model, _ = trained
     buffer, variables = model.replay_buffer, model.transition_variables
-    seen = slice(0, model.causal_moments.n_samples)
+    seen = slice(0, model.causal_statistics.n_samples)
     arrays = (buffer.observations, buffer.actions, buffer.next_observations, buffer.rewards)
     rows = variables.stack(*(values[seen, 0] for values in arrays))
-    np.testing.assert_allclose(model.causal_moments.mean, rows.mean(axis=0), rtol=1e-5, atol=1e-6)
-    np.testing.assert_allclose(model.causal_moments.covariance(), np.cov(rows.T, ddof=0), rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(model.causal_statistics.mean, rows.mean(axis=0), rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(model.causal_statistics.covariance(), np.cov(rows.T, ddof=0), rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.parametrize("buffer_size", [60, 99, 100, 101, 150])

@@ -55,7 +55,7 @@ def learn(env, policy="MlpPolicy", total_timesteps=64, policy_kwargs=None, **kwa
     model.learn(total_timesteps, callback=guided_callback())
     assert model.policy.is_guided and model._n_updates > 0
     assert all(bool(th.isfinite(value).all()) for value in model.policy.state_dict().values())
-    assert model.causal_moments.n_variables == 2 * len(model.policy.state_names()) + model.actor.action_dim + 1
+    assert model.causal_statistics.raw.n_variables == 2 * len(model.policy.state_names()) + model.actor.action_dim + 1
     return model
 
 
@@ -102,8 +102,8 @@ def test_the_moments_get_every_transition_as_the_environment_gave_it(name, n_env
     env = make_vec_env(lambda: SampledEnv(SPACES[name][0]), n_envs=n_envs, seed=0)
     policy = "MultiInputPolicy" if name == "Dict" else "MlpPolicy"
     model = CausalGDP(policy, env, policy_kwargs=POLICY_KWARGS, **{**KWARGS, "learning_starts": 99})
-    fed, update = [], model.causal_moments.update
-    model.causal_moments.update = lambda rows: fed.append(rows) or update(rows)
+    fed, update = [], model.causal_statistics.update
+    model.causal_statistics.update = lambda rows: fed.append(rows) or update(rows)
     callback = CausalWorldModelCallback(refresh_freq=30, min_transitions=1000)
     with pytest.warns(UserWarning, match="Causal discovery waits"):
         model.learn(30, callback=callback)
@@ -207,7 +207,7 @@ def test_with_vec_normalize_the_graph_is_found_in_raw_units_and_the_world_model_
     space = spaces.Box(np.array([99.0, -0.001]), np.array([101.0, 0.001]), dtype=np.float64)
     env = VecNormalize(DummyVecEnv([lambda: SampledEnv(space)]))
     model = learn(env, total_timesteps=128)
-    means = model.causal_moments.mean[:2]
+    means = model.causal_statistics.raw.mean[:2]
     np.testing.assert_allclose(means, [100.0, 0.0], atol=0.3)
     np.testing.assert_allclose(model.world_model.state_mean.numpy(), 0.0, atol=1.0)
     np.testing.assert_allclose(model.world_model.state_std.numpy(), 1.0, atol=0.6)

@@ -327,11 +327,11 @@ def test_the_memory_efficient_buffer_gives_the_world_model_no_jumps_between_epis
         **{**KWARGS, "buffer_size": 50},
     )
     statistics, rows = [], []
-    update_statistics, update = model.world_model.update_statistics, model.causal_moments.update
+    update_statistics, update = model.world_model.update_statistics, model.causal_statistics.update
     monkeypatch.setattr(
         model.world_model, "update_statistics", lambda *args: statistics.append(args) or update_statistics(*args)
     )
-    monkeypatch.setattr(model.causal_moments, "update", lambda values: rows.append(values) or update(values))
+    monkeypatch.setattr(model.causal_statistics, "update", lambda values: rows.append(values) or update(values))
     model.learn(160, callback=guided_callback())
     fed = np.concatenate(rows)
     # Rows are s (2), a (2), s' (2), r
@@ -367,5 +367,5 @@ def test_learning_in_two_parts_is_learning_at_once():
     models[1].learn(56, callback=guided_callback(), reset_num_timesteps=False)
     assert models[0].num_timesteps == models[1].num_timesteps == 128
     assert models[0].causal_graph().num_timesteps == models[1].causal_graph().num_timesteps == 120
-    assert models[0].causal_moments.n_samples == models[1].causal_moments.n_samples == 119
+    assert models[0].causal_statistics.n_samples == models[1].causal_statistics.n_samples == 119
     assert th.equal(parameters(models[0]), parameters(models[1]))

@@ -49,7 +49,7 @@ class RecordingCallback(CausalWorldModelCallback):
 
     def refresh(self):
         super().refresh()
-        self.refreshes.append((self.model.num_timesteps, self.model.causal_moments.n_samples))
+        self.refreshes.append((self.model.num_timesteps, self.model.causal_statistics.n_samples))
 
 
 class PlaneEnv(gym.Env):
@@ -159,10 +159,13 @@ def test_what_is_known_of_the_causes_survives(trained, saved):
     assert loaded.causal_graph() == trained.causal_graph()
     assert loaded.causal_graph().num_timesteps == 200
     assert loaded.transition_variables == trained.transition_variables
-    moments, others = trained.causal_moments, loaded.causal_moments
-    for name in ("mean", "comoment", "count", "n_samples", "half_life", "names"):
-        np.testing.assert_array_equal(getattr(moments, name), getattr(others, name))
-    counters = ("num_timesteps", "_n_updates", "_steps_since_refresh", "_moments_position", "_episode_num")
+    for part in ("raw", "dynamics", "reward"):
+        moments, others = getattr(trained.causal_statistics, part), getattr(loaded.causal_statistics, part)
+        for name in ("mean", "count", "n_samples", "half_life", "names"):
+            np.testing.assert_array_equal(getattr(moments, name), getattr(others, name))
+        np.testing.assert_array_equal(moments.covariance(), others.covariance())
+        assert len(moments.leave_one_out()) == len(others.leave_one_out())
+    counters = ("num_timesteps", "_n_updates", "_steps_since_refresh", "_fed_position", "_episode_num")
     for name in counters:
         assert getattr(loaded, name) == getattr(trained, name), name
     assert (loaded.num_timesteps, loaded._steps_since_refresh) == (256, 56)
@@ -340,7 +343,7 @@ class RecordingCallback(CausalWorldModelCallback):
     refreshes = []
     def refresh(self):
         super().refresh()
-        self.refreshes.append((self.model.num_timesteps, self.model.causal_moments.n_samples))
+        self.refreshes.append((self.model.num_timesteps, self.model.causal_statistics.n_samples))
 
 th.set_num_threads(1)
 folder = sys.argv[1]
@@ -375,7 +378,7 @@ def test_a_new_process_predicts_the_same_and_goes_on_with_the_schedule(trained, 
 
 def test_without_the_replay_buffer_the_moments_go_on_from_what_they_know(saved):
     model = CausalGDP.load(saved / "model.zip", env=gym.make("Pendulum-v1"), device="cpu")
-    known, callback = model.causal_moments.n_samples, RecordingCallback()
+    known, callback = model.causal_statistics.n_samples, RecordingCallback()
     model.learn(150, callback=callback, reset_num_timesteps=False)
     # The 56 steps since the last refresh were in the buffer that was not loaded, and the last step is not stored yet
     assert callback.refreshes == [(300, known + 43), (400, known + 143)]
@@ -398,7 +401,7 @@ def test_a_second_save_and_load_changes_nothing(saved, observations):
 
 def test_a_graph_written_by_hand_survives(saved):
     model = CausalGDP.load(saved / "model.zip", device="cpu")
-    closed = CausalGraph.from_matrices(model.transition_variables, np.zeros((4, 4)), np.zeros((4, 4)), "by hand", 0)
+    closed = CausalGraph(model.transition_variables, np.zeros((4, 4)), np.zeros((4, 4)), "by hand", 0)
     model.set_causal_graph(closed)
     loaded = CausalGDP.load(_bytes_of(model), device="cpu")
     assert loaded.causal_graph() == closed
@@ -433,7 +436,7 @@ def test_arguments_and_custom_objects_replace_what_was_saved(saved):
     assert model.learning_rate == model.lr_schedule(1.0) == 2e-5
     assert not hasattr(model, "unheard_of")
     assert (model.eta, model.policy.discount, model.policy.n_action_candidates) == (0.25, 0.5, 2)
-    assert model.causal_half_life == model.causal_moments.half_life == 77.0
+    assert model.causal_half_life == model.causal_statistics.raw.half_life == 77.0
     assert not model.policy.is_guided
 
 

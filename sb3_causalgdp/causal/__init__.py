@@ -1,21 +1,46 @@
 """Causal discovery on transitions and the world model that it masks. Knows nothing of SB3 nor of diffusion."""
 
-from sb3_causalgdp.causal.discovery import DISCOVERY_METHODS, make_discovery
+from sb3_causalgdp.causal.discovery import (
+    DISCOVERY_METHODS,
+    DiscoveryMethod,
+    Statistics,
+    discover,
+    make_discovery,
+    make_statistics,
+)
 from sb3_causalgdp.causal.graph import CausalGraph
 from sb3_causalgdp.causal.guidance import CausalGuidance, LinearisedGuidance, ReturnTarget, RewardTarget
+from sb3_causalgdp.causal.interventions import (
+    ActionEffects,
+    Counterfactual,
+    EffectStatistics,
+    InterventionalDistribution,
+    StructuralModel,
+    Trajectory,
+)
 from sb3_causalgdp.causal.moments import StreamingMoments
 from sb3_causalgdp.causal.variables import TransitionVariables
 from sb3_causalgdp.causal.world_model import MaskedWorldModel
 
 __all__ = [
     "DISCOVERY_METHODS",
+    "ActionEffects",
     "CausalGraph",
     "CausalGuidance",
+    "Counterfactual",
+    "DiscoveryMethod",
+    "EffectStatistics",
+    "InterventionalDistribution",
     "LinearisedGuidance",
     "MaskedWorldModel",
     "ReturnTarget",
     "RewardTarget",
+    "Statistics",
     "StreamingMoments",
+    "StructuralModel",
+    "Trajectory",
     "TransitionVariables",
+    "discover",
     "make_discovery",
+    "make_statistics",
 ]

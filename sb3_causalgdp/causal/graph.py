@@ -1,6 +1,8 @@
 import json
 import os
 import uuid
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -11,149 +13,206 @@ from sb3_causalgdp.causal.variables import TransitionVariables
 
 if TYPE_CHECKING:
     import networkx as nx
+    import pandas as pd
     from matplotlib.figure import Figure
 
+    from sb3_causalgdp.causal.summary import Groups
+
 PLOTS_HINT = 'matplotlib and networkx are needed for this: pip install "sb3_causalgdp[plots]"'
-BLOCKS = ("state_to_state", "action_to_state", "state_to_reward", "action_to_reward")
 
 
 class Edge(NamedTuple):
-    """One open edge: names of cause and effect, mask in (0, 1], signed weight in standardised units."""
+    """One edge: names of cause and effect, mask in [0, 1], signed strength and its standard error (NaN: not known)."""
 
     cause: str
     effect: str
     mask: float
-    weight: float
+    strength: float
+    standard_error: float
+
+    def __str__(self) -> str:
+        error = "" if np.isnan(self.standard_error) else f" +- {self.standard_error:.2g}"
+        return f"{self.cause} -> {self.effect}: mask {self.mask:.2f}, strength {self.strength:+.2f}{error}"
+
+
+class GraphDiff(NamedTuple):
+    """
+    What changed from an earlier graph to a later one. Edges are as in the later graph, closed ones as in the earlier.
+
+    :param opened: Edges that were closed
+    :param closed: Edges that were open and are not any more
+    :param strengthened: Open in both, with a larger effect
+    :param weakened: Open in both, with a smaller effect
+    :param flipped: Open in both, with an effect of the other sign
+    """
+
+    opened: list[Edge]
+    closed: list[Edge]
+    strengthened: list[Edge]
+    weakened: list[Edge]
+    flipped: list[Edge]
+
+    def __str__(self) -> str:
+        lines = []
+        for name, edges in self._asdict().items():
+            if edges:
+                lines += [f"{name} ({len(edges)}):", *(f"  {edge}" for edge in edges)]
+        return "\n".join(lines) or "no edge changed"
 
 
 @dataclass(eq=False)
 class CausalGraph:
     """
-    What causes what in one transition: soft masks, and the signed weights that they were made from.
+    What causes what in one transition: soft masks, and the signed effects beside them.
 
-    Row j of ``state_to_state`` and ``action_to_state`` says which s_i and a_i cause s'_j. ``state_to_reward`` refers to the
-    *next* state: it says which s_{t+1} cause r_t. Masks lie in [0, 1], 0 is a closed edge. Weights are in standardised
-    units (standard deviations of the effect per standard deviation of the cause).
+    Everything lies in one layout, shape (n + 1, n + d): a row for each next state s'_j and, last, the reward; a column for
+    each state and action. In the reward's row the states are those of the *next* step: it says which s_{t+1} cause r_t. The
+    blocks have names of their own: ``state_to_state`` (C_ss), ``action_to_state`` (C_as), ``state_to_reward`` (U_sr) and
+    ``action_to_reward`` (U_ar), and the same with ``effect_`` and ``se_`` in front. They are views, not copies.
 
     :param variables: Names and order of the variables, n states and d actions
-    :param state_to_state: Mask C_ss, shape (n, n)
-    :param action_to_state: Mask C_as, shape (n, d)
-    :param state_to_reward: Mask U_sr, shape (n,)
-    :param action_to_reward: Mask U_ar, shape (d,)
-    :param weight_state_to_state: shape (n, n)
-    :param weight_action_to_state: shape (n, d)
-    :param weight_state_to_reward: shape (n,)
-    :param weight_action_to_reward: shape (d,)
+    :param masks: Probability or strength of an edge in [0, 1], 0 is a closed edge, shape (n + 1, n + d)
+    :param effects: Signed strengths in standardised units (standard deviations of the effect per standard deviation of the
+        cause), shape (n + 1, n + d)
     :param method: Name of the discovery method
     :param n_samples: Number of transitions it was found from
+    :param standard_errors: Of the effects, shape (n + 1, n + d); None where the method does not know them
+    :param r_squared: Share of each row's variance that its causes explain, shape (n + 1,), or None
+    :param action_vif: Variance inflation factor of each action: how well the states and the other actions predict it, shape
+        (d,), or None; where it is large, the behaviour policy confounds the action with the states
+    :param constant_variables: Names of the variables that never moved; they have no edges
+    :param duplicated_variables: Groups of names that are linear functions of each other; a group shares its masks
     :param num_timesteps: Environment steps when it was found
     :param found_at: ISO 8601 time when it was found
-    :param constant_variables: Names of the variables that never moved; they have no edges
-    :raises ValueError: when a shape does not fit, a value is not finite or a mask is outside [0, 1]
+    :raises ValueError: when a shape does not fit, a value is not finite, a mask is outside [0, 1], a name is not that of a
+        variable, or a number of samples or steps is not a whole one
     """
 
     variables: TransitionVariables
-    state_to_state: np.ndarray
-    action_to_state: np.ndarray
-    state_to_reward: np.ndarray
-    action_to_reward: np.ndarray
-    weight_state_to_state: np.ndarray
-    weight_action_to_state: np.ndarray
-    weight_state_to_reward: np.ndarray
-    weight_action_to_reward: np.ndarray
+    masks: np.ndarray
+    effects: np.ndarray
     method: str
     n_samples: int
+    standard_errors: np.ndarray | None = None
+    r_squared: np.ndarray | None = None
+    action_vif: np.ndarray | None = None
+    constant_variables: tuple[str, ...] = ()
+    duplicated_variables: tuple[tuple[str, ...], ...] = ()
     num_timesteps: int | None = None
     found_at: str | None = None
-    constant_variables: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         n_states, n_actions = self.variables.n_states, self.variables.n_actions
-        shapes = ((n_states, n_states), (n_states, n_actions), (n_states,), (n_actions,))
-        for block, shape in zip(BLOCKS, shapes, strict=True):
-            for name in (block, f"weight_{block}"):
-                values = np.array(getattr(self, name), dtype=np.float64)
-                if values.shape != shape:
-                    raise ValueError(f"{name} must have shape {shape}, got {values.shape}")
-                if not np.isfinite(values).all():
-                    raise ValueError(f"{name} must be finite, got NaN or infinite entries")
-                setattr(self, name, values)
-            mask = getattr(self, block)
-            if mask.min() < 0 or mask.max() > 1:
-                raise ValueError(f"{block} is a mask and must lie in [0, 1], got [{mask.min():g}, {mask.max():g}]")
-        self.constant_variables = tuple(self.constant_variables)
-
-    @classmethod
-    def from_matrices(
-        cls,
-        variables: TransitionVariables,
-        masks: np.ndarray,
-        weights: np.ndarray,
-        method: str,
-        n_samples: int,
-        **details: Any,
-    ) -> "CausalGraph":
-        """
-        Cut a graph out of one matrix of masks and one of weights, laid out as the properties of these names.
-
-        :param variables: Names and order of the variables
-        :param masks: shape (n + 1, n + d)
-        :param weights: shape (n + 1, n + d)
-        :param method: Name of the discovery method
-        :param n_samples: Number of transitions it was found from
-        :param details: The class's further arguments
-        """
-        n_states = variables.n_states
-        shape = (n_states + 1, n_states + variables.n_actions)
-        for name, matrix in (("masks", masks), ("weights", weights)):
-            if matrix.shape != shape:
-                raise ValueError(f"{name} must have shape {shape}, got {matrix.shape}")
-        return cls(
-            variables=variables,
-            state_to_state=masks[:-1, :n_states],
-            action_to_state=masks[:-1, n_states:],
-            state_to_reward=masks[-1, :n_states],
-            action_to_reward=masks[-1, n_states:],
-            weight_state_to_state=weights[:-1, :n_states],
-            weight_action_to_state=weights[:-1, n_states:],
-            weight_state_to_reward=weights[-1, :n_states],
-            weight_action_to_reward=weights[-1, n_states:],
-            method=method,
-            n_samples=n_samples,
-            **details,
+        matrix = (n_states + 1, n_states + n_actions)
+        self.masks = _checked("masks", self.masks, matrix)
+        self.effects = _checked("effects", self.effects, matrix)
+        for name, shape in (("standard_errors", matrix), ("r_squared", matrix[:1]), ("action_vif", (n_actions,))):
+            if getattr(self, name) is not None:
+                setattr(self, name, _checked(name, getattr(self, name), shape))
+        if self.masks.min() < 0 or self.masks.max() > 1:
+            raise ValueError(f"masks must lie in [0, 1], got values from {self.masks.min():g} to {self.masks.max():g}")
+        if self.standard_errors is not None and self.standard_errors.min() < 0:
+            raise ValueError(f"standard_errors must be at least 0, got {self.standard_errors.min():g}")
+        self._check_scalars()
+        self.constant_variables = _checked_names("constant_variables", self.constant_variables, self.variables)
+        if isinstance(self.duplicated_variables, str) or not isinstance(self.duplicated_variables, Iterable):
+            raise ValueError(f"duplicated_variables must be groups of names, got {self.duplicated_variables!r}")
+        self.duplicated_variables = tuple(
+            _checked_names("duplicated_variables", group, self.variables) for group in self.duplicated_variables
         )
+
+    def _check_scalars(self) -> None:
+        for name in ("method", "found_at"):
+            value = getattr(self, name)
+            if not (isinstance(value, str) or (value is None and name == "found_at")):
+                raise ValueError(f"{name} must be a string, got {value!r}")
+        for name in ("n_samples", "num_timesteps"):
+            value = getattr(self, name)
+            if value is None and name == "num_timesteps":
+                continue
+            if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 0:
+                raise ValueError(f"{name} must be an integer of at least 0, got {value!r}")
+            setattr(self, name, int(value))
 
     @classmethod
     def fully_connected(cls, variables: TransitionVariables) -> "CausalGraph":
         """
-        Everything may cause everything: all masks 1, all weights 0, the start before any discovery.
+        Everything may cause everything: all masks 1, all effects 0, the start before any discovery.
 
         :param variables: Names and order of the variables
         """
         shape = (variables.n_states + 1, variables.n_states + variables.n_actions)
-        return cls.from_matrices(variables, np.ones(shape), np.zeros(shape), method="none", n_samples=0)
+        return cls(variables, np.ones(shape), np.zeros(shape), method="none", n_samples=0)
 
     @property
-    def masks(self) -> np.ndarray:
-        """A copy of all masks, shape (n + 1, n + d): rows s' and reward; columns s (in the reward's row s') and a."""
-        return np.block(
-            [[self.state_to_state, self.action_to_state], [self.state_to_reward[None], self.action_to_reward[None]]]
-        )
+    def state_to_state(self) -> np.ndarray:
+        """C_ss, shape (n, n)."""
+        return self.masks[:-1, : self.variables.n_states]
 
     @property
-    def weights(self) -> np.ndarray:
-        """A copy of all weights, laid out as ``masks``."""
-        return np.block(
-            [
-                [self.weight_state_to_state, self.weight_action_to_state],
-                [self.weight_state_to_reward[None], self.weight_action_to_reward[None]],
-            ]
-        )
+    def action_to_state(self) -> np.ndarray:
+        """C_as, shape (n, d)."""
+        return self.masks[:-1, self.variables.n_states :]
+
+    @property
+    def state_to_reward(self) -> np.ndarray:
+        """U_sr, shape (n,)."""
+        return self.masks[-1, : self.variables.n_states]
+
+    @property
+    def action_to_reward(self) -> np.ndarray:
+        """U_ar, shape (d,)."""
+        return self.masks[-1, self.variables.n_states :]
+
+    @property
+    def effect_state_to_state(self) -> np.ndarray:
+        """Effects in standardised units, shape (n, n)."""
+        return self.effects[:-1, : self.variables.n_states]
+
+    @property
+    def effect_action_to_state(self) -> np.ndarray:
+        """Effects in standardised units, shape (n, d)."""
+        return self.effects[:-1, self.variables.n_states :]
+
+    @property
+    def effect_state_to_reward(self) -> np.ndarray:
+        """Effects in standardised units, shape (n,)."""
+        return self.effects[-1, : self.variables.n_states]
+
+    @property
+    def effect_action_to_reward(self) -> np.ndarray:
+        """Effects in standardised units, shape (d,)."""
+        return self.effects[-1, self.variables.n_states :]
+
+    def _known_standard_errors(self) -> np.ndarray:
+        if self.standard_errors is None:
+            raise ValueError(f"the method {self.method!r} knows no standard errors")
+        return self.standard_errors
+
+    @property
+    def se_state_to_state(self) -> np.ndarray:
+        """Standard errors of ``effect_state_to_state``, shape (n, n); ValueError where they are not known."""
+        return self._known_standard_errors()[:-1, : self.variables.n_states]
+
+    @property
+    def se_action_to_state(self) -> np.ndarray:
+        """Standard errors of ``effect_action_to_state``, shape (n, d); ValueError where they are not known."""
+        return self._known_standard_errors()[:-1, self.variables.n_states :]
+
+    @property
+    def se_state_to_reward(self) -> np.ndarray:
+        """Standard errors of ``effect_state_to_reward``, shape (n,); ValueError where they are not known."""
+        return self._known_standard_errors()[-1, : self.variables.n_states]
+
+    @property
+    def se_action_to_reward(self) -> np.ndarray:
+        """Standard errors of ``effect_action_to_reward``, shape (d,); ValueError where they are not known."""
+        return self._known_standard_errors()[-1, self.variables.n_states :]
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, CausalGraph):
             return NotImplemented
-        return all(np.array_equal(getattr(self, f.name), getattr(other, f.name)) for f in fields(self))
+        return all(_equal(getattr(self, f.name), getattr(other, f.name)) for f in fields(self))
 
     @property
     def n_edges(self) -> int:
@@ -166,32 +225,80 @@ class CausalGraph:
         :return: mean absolute difference over all mask entries, from 0 (same masks) to 1 (all open against all closed)
         :raises ValueError: when the variables differ
         """
+        self._check_same_variables(other)
+        return float(np.abs(self.masks - other.masks).mean())
+
+    def diff(self, other: "CausalGraph", threshold: float = 0.5, min_change: float = 0.1) -> GraphDiff:
+        """
+        What changed since an earlier graph, edge by edge; ``print`` shows it.
+
+        :param other: The earlier graph, over the same variables
+        :param threshold: Masks above it are open edges, in [0, 1)
+        :param min_change: Smallest change of an open edge's effect that counts, in standardised units, at least 0
+        :return: the edges that opened, closed, or whose effect changed
+        :raises ValueError: when the variables differ or a number is out of range
+        """
+        self._check_same_variables(other)
+        if not 0 <= threshold < 1:
+            raise ValueError(f"threshold must be in [0, 1), got {threshold!r}")
+        if not min_change >= 0:
+            raise ValueError(f"min_change must be at least 0, got {min_change!r}")
+        before, now = other.masks > threshold, self.masks > threshold
+        changed = before & now & (np.abs(self.effects - other.effects) > min_change)
+        flipped = changed & (self.effects * other.effects < 0)
+        larger = np.abs(self.effects) > np.abs(other.effects)
+        return GraphDiff(
+            opened=self._edges(now & ~before),
+            closed=other._edges(before & ~now),
+            strengthened=self._edges(changed & ~flipped & larger),
+            weakened=self._edges(changed & ~flipped & ~larger),
+            flipped=self._edges(flipped),
+        )
+
+    def _check_same_variables(self, other: "CausalGraph") -> None:
         if other.variables != self.variables:
             raise ValueError(f"other must be over the same variables {self.variables.names}, got {other.variables.names}")
-        return float(np.abs(self.masks - other.masks).mean())
 
     def edges(self) -> list[Edge]:
         """
-        :return: all open edges, grouped by effect, in the order of the variables
+        :return: all open edges (mask > 0), grouped by effect, in the order of the variables
         """
-        variables, masks, weights = self.variables, self.masks, self.weights
+        return self._edges(self.masks > 0)
+
+    def _edges(self, chosen: np.ndarray) -> list[Edge]:
+        """The edges at the True entries of an array of the masks' shape."""
+        variables = self.variables
+        errors = np.full_like(self.masks, np.nan) if self.standard_errors is None else self.standard_errors
         causes_of_state = (*variables.state_names, *variables.action_names)
         causes_of_reward = (*variables.next_state_names, *variables.action_names)
         effects = (*variables.next_state_names, "reward")
         return [
             Edge(
-                cause=(causes_of_reward if effects[j] == "reward" else causes_of_state)[i],
+                cause=(causes_of_state if j < variables.n_states else causes_of_reward)[i],
                 effect=effects[j],
-                mask=float(masks[j, i]),
-                weight=float(weights[j, i]),
+                mask=float(self.masks[j, i]),
+                strength=float(self.effects[j, i]),
+                standard_error=float(errors[j, i]),
             )
-            for j, i in np.argwhere(masks > 0)
+            for j, i in np.argwhere(chosen)
         ]
+
+    def to_dataframe(self) -> "pd.DataFrame":
+        """
+        :return: a row for each pair of variables that time allows, open or closed, in the order of ``edges``; the columns are
+            the fields of :class:`Edge`
+        :raises ImportError: when pandas is missing
+        """
+        try:
+            import pandas as pd
+        except ImportError as error:
+            raise ImportError("pandas is needed for this: pip install pandas") from error
+        return pd.DataFrame(self._edges(np.ones_like(self.masks)), columns=list(Edge._fields))
 
     def to_networkx(self) -> "nx.DiGraph":
         """
         :return: directed graph of all variables and the open edges; nodes have ``layer`` (0: s_t and a_t, 1: s_{t+1},
-            2: reward), edges have ``mask`` and ``weight``
+            2: reward), edges have ``mask`` and ``strength``
         :raises ImportError: when networkx is missing
         """
         try:
@@ -203,7 +310,7 @@ class CausalGraph:
         graph.add_nodes_from(self.variables.next_state_names, layer=1)
         graph.add_node("reward", layer=2)
         for edge in self.edges():
-            graph.add_edge(edge.cause, edge.effect, mask=edge.mask, weight=edge.weight)
+            graph.add_edge(edge.cause, edge.effect, mask=edge.mask, strength=edge.strength)
         return graph
 
     def to_json(self) -> str:
@@ -212,9 +319,9 @@ class CausalGraph:
         """
         content: dict[str, Any] = {f.name: getattr(self, f.name) for f in fields(self)}
         content["variables"] = {"state_names": self.variables.state_names, "action_names": self.variables.action_names}
-        for block in BLOCKS:
-            for name in (block, f"weight_{block}"):
-                content[name] = content[name].tolist()
+        for name, value in content.items():
+            if isinstance(value, np.ndarray):
+                content[name] = value.tolist()
         return json.dumps(content)
 
     @classmethod
@@ -227,12 +334,17 @@ class CausalGraph:
             content = json.loads(text)
         except json.JSONDecodeError as error:
             raise ValueError(f"text is not JSON: {error}") from error
+        if not isinstance(content, dict):
+            raise ValueError(f"text is not a causal graph: it holds a {type(content).__name__}, not an object")
         expected = {f.name for f in fields(cls)}
-        if not isinstance(content, dict) or set(content) != expected:
-            given = sorted(content) if isinstance(content, dict) else type(content).__name__
-            raise ValueError(f"text is not a causal graph: its fields must be {sorted(expected)}, got {given}")
-        content["variables"] = TransitionVariables(**content["variables"])
-        return cls(**content)
+        if set(content) != expected:
+            missing, unknown = sorted(expected - set(content)), sorted(set(content) - expected)
+            raise ValueError(f"text is not a causal graph of this version: missing fields {missing}, unknown fields {unknown}")
+        try:
+            content["variables"] = TransitionVariables(**content["variables"])
+            return cls(**content)
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"text is not a causal graph: {error}") from error
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """
@@ -240,32 +352,88 @@ class CausalGraph:
 
         :param path: File to write; its folder is created
         """
-        path = Path(path)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}")
-        try:
+        with replaced_when_done(path) as temporary:
             temporary.write_text(self.to_json(), encoding="utf-8")
-            os.replace(temporary, path)
-        finally:
-            temporary.unlink(missing_ok=True)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> "CausalGraph":
         """
         :param path: File that ``save`` wrote
+        :raises ValueError: when the file does not hold a graph
         """
         return cls.from_json(Path(path).read_text(encoding="utf-8"))
 
-    def plot(self, path: str | os.PathLike[str] | None = None, kind: str = "both", max_variables: int = 40) -> "Figure":
+    def plot(
+        self,
+        path: str | os.PathLike[str] | None = None,
+        kind: str = "both",
+        max_variables: int = 40,
+        *,
+        values: str = "masks",
+        groups: "Groups" = "auto",
+        aggregate: str = "mean",
+    ) -> "Figure":
         """
         Draw the graph, without pyplot's global state (a notebook shows the figure after ``%matplotlib inline``).
 
         :param path: Image file to write, by its suffix; None writes nothing
         :param kind: ``"heat_map"``, ``"graph"`` or ``"both"``
-        :param max_variables: Draw at most this many states and actions, those with the largest total mask
+        :param max_variables: More states and actions than this are summarised, see ``groups``
+        :param values: What the heat map's colours are: ``"masks"``, with the signs of the effects, or ``"effects"``
+        :param groups: How to summarise, see :func:`~sb3_causalgdp.causal.summary.summarize`
+        :param aggregate: ``"mean"`` or ``"max"`` of a group's entries
         :return: the matplotlib figure
         :raises ImportError: when matplotlib or networkx is missing
+        :raises ValueError: on an argument out of range
         """
         from sb3_causalgdp.causal.plots import plot_causal_graph
 
-        return plot_causal_graph(self, path, kind, max_variables)
+        return plot_causal_graph(self, path, kind, max_variables, values=values, groups=groups, aggregate=aggregate)
+
+
+@contextmanager
+def replaced_when_done(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """
+    Give a temporary file beside ``path`` to write to; it takes the place of ``path`` if the block ends without an error.
+
+    :param path: File to write; its folder is created
+    """
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}")
+    try:
+        yield temporary
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def _equal(one: Any, other: Any) -> bool:
+    if isinstance(one, np.ndarray) and isinstance(other, np.ndarray):
+        return np.array_equal(one, other)
+    return type(one) is type(other) and one == other
+
+
+def _checked(name: str, values: Any, shape: tuple[int, ...]) -> np.ndarray:
+    """The values as a new float64 array of this shape, all finite."""
+    try:
+        values = np.array(values, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{name} must be numbers of shape {shape}: {error}") from error
+    if values.shape != shape:
+        raise ValueError(f"{name} must have shape {shape}, got {values.shape}")
+    if not np.isfinite(values).all():
+        raise ValueError(f"{name} must be finite, got NaN or infinite entries")
+    return values
+
+
+def _checked_names(argument: str, names: Any, variables: TransitionVariables) -> tuple[str, ...]:
+    """The names as a tuple, all of them variables."""
+    if isinstance(names, str) or not isinstance(names, Iterable):
+        raise ValueError(f"{argument} must be names of variables, got {names!r}")
+    names = tuple(names)
+    known = variables.names
+    unknown = [name for name in names if name not in known]
+    if unknown:
+        raise ValueError(f"{argument} must be names of variables, got {unknown}, known are {known}")
+    return names

@@ -7,7 +7,8 @@ from sklearn.linear_model import Lasso
 from sklearn.metrics import roc_auc_score
 
 from sb3_causalgdp.causal import DISCOVERY_METHODS, CausalGraph, StreamingMoments, TransitionVariables, make_discovery
-from sb3_causalgdp.causal.discovery.notears import Notears, solve_lasso_gram
+from sb3_causalgdp.causal.discovery.lasso import solve_lasso_gram
+from sb3_causalgdp.causal.discovery.notears import Notears
 
 
 def make_variables(n_states, n_actions):
@@ -47,10 +48,10 @@ def moments_of(rows):
 
 def weights_of(graph):
     return [
-        graph.weight_state_to_state,
-        graph.weight_action_to_state,
-        graph.weight_state_to_reward,
-        graph.weight_action_to_reward,
+        graph.effect_state_to_state,
+        graph.effect_action_to_state,
+        graph.effect_state_to_reward,
+        graph.effect_action_to_reward,
     ]
 
 
@@ -91,9 +92,9 @@ def test_equals_scikit_learns_lasso_on_standardised_data():
     lasso = Lasso(alpha=0.03, fit_intercept=False, tol=1e-10, max_iter=100_000)
     to_state = lasso.fit(np.hstack([state, action]), after).coef_
     to_reward = lasso.fit(np.hstack([after, action]), standardised[:, 24]).coef_
-    np.testing.assert_allclose(np.hstack([graph.weight_state_to_state, graph.weight_action_to_state]), to_state, atol=1e-6)
+    np.testing.assert_allclose(np.hstack([graph.effect_state_to_state, graph.effect_action_to_state]), to_state, atol=1e-6)
     np.testing.assert_allclose(
-        np.concatenate([graph.weight_state_to_reward, graph.weight_action_to_reward]), to_reward, atol=1e-6
+        np.concatenate([graph.effect_state_to_reward, graph.effect_action_to_reward]), to_reward, atol=1e-6
     )
 
 
@@ -104,7 +105,7 @@ def test_without_standardize_it_is_the_lasso_on_the_variables_own_units():
     raw = Lasso(alpha=0.03, fit_intercept=False, tol=1e-10, max_iter=100_000).fit(centred[:, :14], centred[:, 14:24]).coef_
     scale = rows.std(axis=0)
     expected = raw * scale[:14] / scale[14:24, None]
-    np.testing.assert_allclose(np.hstack([graph.weight_state_to_state, graph.weight_action_to_state]), expected, atol=1e-6)
+    np.testing.assert_allclose(np.hstack([graph.effect_state_to_state, graph.effect_action_to_state]), expected, atol=1e-6)
 
 
 @pytest.mark.parametrize("n_rows", [2_000, 20_000])
@@ -160,9 +161,9 @@ def test_constant_columns_have_no_edge_and_give_no_warning():
         warnings.simplefilter("error")
         graph = Notears()(moments_of(rows), variables, previous=_all_weights_one(variables))
     assert graph.constant_variables == ("s1", "s1'", "reward")
-    assert not graph.weight_state_to_state[1].any() and not graph.weight_state_to_state[:, 1].any()
-    assert not graph.weight_action_to_state[1].any()
-    assert not graph.weight_state_to_reward.any() and not graph.weight_action_to_reward.any()
+    assert not graph.effect_state_to_state[1].any() and not graph.effect_state_to_state[:, 1].any()
+    assert not graph.effect_action_to_state[1].any()
+    assert not graph.effect_state_to_reward.any() and not graph.effect_action_to_reward.any()
     assert not graph.state_to_state[1].any() and not graph.state_to_reward.any()
 
 

@@ -1,3 +1,4 @@
+import re
 import sys
 import warnings
 from dataclasses import replace
@@ -5,31 +6,57 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
+from matplotlib.patches import FancyArrowPatch
+from PIL import Image
 
 from sb3_causalgdp.causal import CausalGraph, TransitionVariables
-from sb3_causalgdp.causal.plots import plot_causal_graph, plot_graph, plot_heat_map
+from sb3_causalgdp.causal.plots import animate_history, plot_causal_graph, plot_graph, plot_heat_map, plot_history
 
 
-def make_graph(n_states=3, n_actions=1):
+def make_graph(n_states=3, n_actions=1, **changes):
     variables = TransitionVariables(
         tuple(f"obs[{i}]" for i in range(n_states)), tuple(f"action[{i}]" for i in range(n_actions))
     )
-    return CausalGraph.fully_connected(variables)
+    return replace(CausalGraph.fully_connected(variables), **changes)
+
+
+def make_history(length, n_states=2, n_actions=1, every=1000):
+    """Entry by entry, the masks close, from the first one on."""
+    graphs = []
+    for number in range(length):
+        graph = make_graph(n_states, n_actions, num_timesteps=every * (number + 1))
+        graph.masks.flat[:number] = 0.0
+        graphs.append(graph)
+    return graphs
 
 
 def texts(axes):
     return [text.get_text() for text in (*axes.texts, *axes.get_xticklabels(), *axes.get_yticklabels())]
 
 
+def matrix_of(axes):
+    return np.asarray(axes.images[0].get_array())
+
+
+def arrows(axes):
+    return [patch for patch in axes.patches if isinstance(patch, FancyArrowPatch)]
+
+
+def history_axes(figure):
+    """The heat maps, and the curves of edges and changes."""
+    return [axes for axes in figure.axes if axes.images], [axes for axes in figure.axes if axes.lines and not axes.images]
+
+
 @pytest.mark.parametrize("kind", ["heat_map", "graph", "both"])
 @pytest.mark.parametrize("size", [(3, 1), (17, 6)])
 def test_plot_writes_an_image_without_a_warning(tmp_path, kind, size):
-    path = tmp_path / "graph.png"
+    path = tmp_path / "folder" / "graph.png"
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         figure = make_graph(*size).plot(path, kind=kind)
     assert isinstance(figure, Figure)
     assert path.stat().st_size > 5_000
+    assert list(path.parent.iterdir()) == [path]
 
 
 @pytest.mark.parametrize("draw", [plot_heat_map, plot_graph])
@@ -44,38 +71,101 @@ def test_axes_say_cause_and_effect():
     assert axes.get_ylabel() == "effect"
 
 
-def test_heat_map_has_the_masks_with_the_signs_of_the_weights():
+def test_heat_map_has_the_masks_with_the_signs_of_the_effects():
     graph = make_graph(2, 1)
     graph.state_to_state[0, 1] = 0.25
-    graph.weight_state_to_state[0, 1] = -3.0
+    graph.effect_state_to_state[0, 1] = -3.0
     graph.state_to_reward[1] = 0.5
     expected = np.ones((3, 3))
     expected[0, 1], expected[2, 1] = -0.25, 0.5
-    np.testing.assert_array_equal(plot_heat_map(graph).images[0].get_array(), expected)
+    axes = plot_heat_map(graph)
+    np.testing.assert_array_equal(matrix_of(axes), expected)
+    assert axes.images[0].get_clim() == (-1.0, 1.0)
+
+
+def test_heat_map_of_effects_has_a_scale_as_wide_as_the_largest():
+    graph = make_graph(2, 1)
+    graph.effects[0] = [0.5, -3.0, 0.0]
+    axes = plot_heat_map(graph, values="effects")
+    np.testing.assert_array_equal(matrix_of(axes), graph.effects)
+    assert axes.images[0].get_clim() == (-3.0, 3.0)
+    assert axes.get_title() == "Causal effects"
+
+
+def test_standard_errors_are_numbers_in_a_small_heat_map_of_effects():
+    graph = make_graph(2, 1, standard_errors=np.full((3, 3), 0.25))
+    graph.effects[1, 2] = -0.5
+    cells = {tuple(text.get_position()): text.get_text() for text in plot_heat_map(graph, values="effects").texts}
+    assert cells[2, 1] == "-0.50\n\u00b10.25"
+    assert len(cells) == 9
+    assert not plot_heat_map(graph).texts
+
+
+def test_dots_mark_the_effects_that_may_be_zero_in_a_larger_heat_map():
+    graph = make_graph(8, 2, standard_errors=np.full((9, 10), 0.25))
+    graph.effects[3, 4], graph.effects[5, 6] = 0.4, -0.6
+    axes = plot_heat_map(graph, values="effects")
+    dots = next(collection for collection in axes.collections if "two standard errors" in str(collection.get_label()))
+    np.testing.assert_array_equal(dots.get_offsets(), [[4, 3]])
 
 
 def test_a_graph_without_edges_can_be_drawn(tmp_path):
     graph = make_graph(1, 1)
-    empty = replace(
-        graph,
-        state_to_state=np.zeros((1, 1)),
-        action_to_state=np.zeros((1, 1)),
-        state_to_reward=np.zeros(1),
-        action_to_reward=np.zeros(1),
-    )
-    empty.plot(tmp_path / "graph.png")
+    empty = replace(graph, masks=np.zeros_like(graph.masks))
+    for values in ("masks", "effects"):
+        empty.plot(tmp_path / "graph.png", values=values)
+        empty.plot(tmp_path / "graph.png", values=values, groups={"obs[0]": "obs"})
     assert "0 edges" in plot_graph(empty).get_title()
+    plot_history([empty, empty], tmp_path / "history.png")
 
 
-def test_large_graphs_show_the_most_connected_variables_and_say_so():
+def test_layered_graph_colours_edges_by_the_sign_of_the_effect():
+    graph = make_graph(1, 1)
+    graph.masks[:] = [[1.0, 0.0], [0.0, 0.5]]
+    graph.effects[:] = [[-1.0, 0.0], [0.0, 1.0]]
+    weak, strong = arrows(plot_graph(graph))
+    assert weak.get_linewidth() < strong.get_linewidth()
+    assert weak.get_edgecolor()[0] > weak.get_edgecolor()[2]  # red
+    assert strong.get_edgecolor()[2] > strong.get_edgecolor()[0]  # blue
+
+
+def test_layered_graph_keeps_the_strongest_edges_and_says_so():
+    graph = make_graph(3, 1)
+    graph.masks[:] = 0.1
+    graph.masks[0, :2] = 0.9
+    axes = plot_graph(graph, max_edges=2)
+    assert len(arrows(axes)) == 2
+    assert len({arrow.get_linewidth() for arrow in arrows(axes)}) == 1
+    assert axes.get_title() == "Causal graph: the 2 strongest of 16 edges"
+
+
+def test_large_graphs_are_drawn_as_groups_with_numbers():
     graph = make_graph(348, 17)
-    for block in (graph.state_to_state, graph.action_to_state, graph.state_to_reward, graph.action_to_reward):
-        block *= 0.01
+    graph.masks[:] = 0.0
+    graph.masks[:20, 20:40] = 0.5
+    axes = plot_heat_map(graph)
+    assert matrix_of(axes).shape == (19, 35)
+    assert matrix_of(axes)[0, 1] == 0.5 and matrix_of(axes).sum() == 0.5
+    assert [text.get_text() for text in axes.texts] == [".50"]
+    assert {"obs[0..19]'", "obs[340..347]", "action[16]", "reward"} <= set(texts(axes))
+    assert axes.get_title().endswith("(mean over groups of 348 states and 17 actions)")
+
+
+def test_large_graphs_can_show_the_most_connected_variables():
+    graph = make_graph(348, 17)
+    graph.masks[:] *= 0.01
     graph.state_to_state[300, 200] = graph.action_to_reward[16] = 1.0
-    axes = plot_heat_map(graph, max_variables=10)
+    axes = plot_heat_map(graph, max_variables=10, groups=None)
     assert {"obs[300]'", "obs[200]", "action[16]"} <= set(texts(axes))
     assert len(axes.get_xticks()) == 10
     assert "10 states and actions with the largest total mask, of 365" in axes.get_title()
+
+
+def test_own_groups_are_on_both_parts_of_the_plot():
+    figure = make_graph(4, 1).plot(groups={"position": 2, "velocity": 2})
+    heat_map, layered = figure.axes[:2]
+    assert {"position", "velocity'", "action[0]"} <= set(texts(heat_map))
+    assert {"position", "velocity'", "action[0]"} <= set(texts(layered))
 
 
 def test_plots_draw_on_the_given_axes():
@@ -83,11 +173,124 @@ def test_plots_draw_on_the_given_axes():
     assert plot_graph(make_graph(), axes) is axes
 
 
-def test_bad_arguments_are_errors():
-    with pytest.raises(ValueError, match=r"kind must be one of .* got 'pie'"):
-        plot_causal_graph(make_graph(), kind="pie")
-    with pytest.raises(ValueError, match="max_variables must be at least 2"):
-        make_graph().plot(max_variables=1)
+def test_history_shows_evenly_chosen_graphs_and_both_ends():
+    graphs = make_history(10)
+    maps, _ = history_axes(plot_history(graphs, max_panels=4))
+    assert [axes.get_title() for axes in maps] == ["1,000 steps", "4,000 steps", "7,000 steps", "10,000 steps"]
+    for axes, number in zip(maps, (0, 3, 6, 9), strict=True):
+        np.testing.assert_array_equal(matrix_of(axes), graphs[number].masks)
+
+
+@pytest.mark.parametrize(("length", "n_maps"), [(1, 1), (3, 3), (5, 5), (8, 8), (20, 8)])
+def test_history_draws_at_most_eight_maps_without_a_warning(tmp_path, length, n_maps):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        figure = plot_history(make_history(length), tmp_path / "history.png")
+    maps, _ = history_axes(figure)
+    assert len(maps) == n_maps
+    assert maps[-1].get_title() == f"{length},000 steps"
+    assert list(tmp_path.iterdir()) == [tmp_path / "history.png"]
+
+
+def test_history_without_steps_numbers_the_graphs_among_all():
+    graphs = [replace(graph, num_timesteps=None) for graph in make_history(9)]
+    maps, _ = history_axes(plot_history(graphs, max_panels=3))
+    assert [axes.get_title() for axes in maps] == ["graph 1 of 9", "graph 5 of 9", "graph 9 of 9"]
+
+
+def test_history_has_curves_of_edges_and_changes_of_all_graphs():
+    graphs = make_history(10)
+    _, (edges, changes) = history_axes(plot_history(graphs, max_panels=2))
+    np.testing.assert_array_equal(edges.lines[0].get_xydata(), [(1000 * (i + 1), 9 - i) for i in range(10)])
+    np.testing.assert_allclose(changes.lines[0].get_xydata(), [(1000 * (i + 1), 1 / 9) for i in range(1, 10)])
+    assert edges.get_title() == "edges (mask > 0.5)"
+    assert changes.get_xlabel() == "environment steps"
+
+
+def test_history_counts_edges_above_the_threshold():
+    graph = make_graph(2, 1)
+    graph.masks[0] = 0.6
+    _, (edges, _) = history_axes(plot_history([graph], threshold=0.7))
+    assert edges.lines[0].get_ydata().tolist() == [6]
+
+
+@pytest.mark.parametrize("steps", [[None, None], [2000, 1000], [None, 1000]])
+def test_history_without_increasing_steps_counts_the_graphs(steps):
+    graphs = [replace(graph, num_timesteps=at) for graph, at in zip(make_history(2), steps, strict=True)]
+    _, (edges, changes) = history_axes(plot_history(graphs))
+    assert edges.lines[0].get_xdata().tolist() == [1, 2]
+    assert changes.get_xlabel() == "number of the graph"
+
+
+def test_history_of_a_large_graph_shows_the_same_groups_on_one_scale():
+    graphs = make_history(2, 50, 3)
+    graphs[0].masks[:] = 0.0
+    graphs[0].masks[0, 0] = 0.5
+    maps, _ = history_axes(plot_history(graphs))
+    assert [matrix_of(axes).shape for axes in maps] == [(11, 13), (11, 13)]
+    assert [axes.images[0].get_clim() for axes in maps] == [(0.0, 1.0), (0.0, 1.0)]
+    assert matrix_of(maps[0])[0, 0] == pytest.approx(0.5 / 25)
+
+
+def test_animation_has_a_frame_for_each_graph_and_stays_on_the_last(tmp_path):
+    path = tmp_path / "folder" / "history.gif"
+    animate_history(make_history(4), path, frames_per_second=4)
+    with Image.open(path) as movie:
+        assert movie.n_frames == 4
+        durations = []
+        for number in range(4):
+            movie.seek(number)
+            durations.append(movie.info["duration"])
+    assert durations == [250, 250, 250, 2000]
+    assert list(path.parent.iterdir()) == [path]
+
+
+def test_failed_writing_keeps_the_old_picture(tmp_path, monkeypatch):
+    path = tmp_path / "graph.png"
+    make_graph().plot(path)
+    before = path.read_bytes()
+    monkeypatch.setattr(Figure, "savefig", lambda _, path, **__: (path.write_bytes(b"half"), 1 / 0))
+    with pytest.raises(ZeroDivisionError):
+        make_graph(2, 2).plot(path)
+    assert path.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("name", ["graph.xyz", "graph"])
+def test_unknown_suffix_is_one_clear_error(tmp_path, name):
+    for draw in (make_graph().plot, lambda path: plot_history(make_history(2), path)):
+        with pytest.raises(ValueError, match=rf"path must end in one of .*\.pdf.*\.png.*, got '.*{re.escape(name)}'"):
+            draw(tmp_path / name)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("suffix", [".PNG", ".svg", ".pdf"])
+def test_the_suffix_is_the_format(tmp_path, suffix):
+    path = tmp_path / f"graph{suffix}"
+    make_graph(1, 1).plot(path, kind="heat_map")
+    assert path.read_bytes()[:4] in (b"\x89PNG", b"<?xm", b"%PDF")
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: plot_causal_graph(make_graph(), kind="pie"), "kind must be one of .* got 'pie'"),
+        (lambda: make_graph().plot(values="signs"), "values must be one of .* got 'signs'"),
+        (lambda: make_graph().plot(max_variables=1), "max_variables must be at least 2"),
+        (lambda: make_graph().plot(aggregate="sum"), "aggregate must be one of .* got 'sum'"),
+        (lambda: plot_graph(make_graph(), max_edges=0), "max_edges must be at least 1, got 0"),
+        (lambda: plot_history([]), "graphs is empty"),
+        (lambda: plot_history([make_graph(1), make_graph(2)]), "graphs must be over the same variables"),
+        (lambda: plot_history([make_graph()], max_panels=9), "max_panels must be from 1 to 8, got 9"),
+        (lambda: plot_history([make_graph()], threshold=1.0), r"threshold must be in \[0, 1\), got 1.0"),
+        (lambda: animate_history([make_graph()], "a.png"), "path must end in .gif, got 'a.png'"),
+        (lambda: animate_history([make_graph()], "a.gif", frames_per_second=0), "frames_per_second must be above 0"),
+        (lambda: animate_history([], "a.gif"), "graphs is empty"),
+    ],
+)
+def test_bad_arguments_are_errors(call, message):
+    with pytest.raises(ValueError, match=message):
+        call()
 
 
 @pytest.mark.parametrize("missing", ["matplotlib.figure", "networkx"])

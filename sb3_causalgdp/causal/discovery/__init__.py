@@ -1,24 +1,51 @@
+"""Causal discovery by name: each method says what it gathers from a stream of transitions and turns that into a graph."""
+
 import inspect
 from collections.abc import Callable
 from typing import Any, Protocol
 
+import numpy.typing as npt
+
 from sb3_causalgdp.causal.discovery.notears import Notears
+from sb3_causalgdp.causal.discovery.partial_r2 import PartialR2
 from sb3_causalgdp.causal.graph import CausalGraph
 from sb3_causalgdp.causal.moments import StreamingMoments
 from sb3_causalgdp.causal.variables import TransitionVariables
 
-__all__ = ["DISCOVERY_METHODS", "DiscoveryMethod", "Notears", "make_discovery"]
+__all__ = [
+    "DISCOVERY_METHODS",
+    "DiscoveryMethod",
+    "Notears",
+    "PartialR2",
+    "Statistics",
+    "discover",
+    "make_discovery",
+    "make_statistics",
+]
+
+
+class Statistics(Protocol):
+    """What a method gathers from a stream of transitions: rows ``[s, a, s', r]`` in the order of the variables."""
+
+    n_samples: int
+
+    def update(self, rows: npt.ArrayLike) -> None: ...
 
 
 class DiscoveryMethod(Protocol):
-    """Turns the moments of transitions into a causal graph; any callable of this signature will do."""
+    """
+    Turns statistics of transitions into a causal graph; any callable of this signature will do.
+
+    A method that needs more than :class:`StreamingMoments` has a method ``make_statistics`` as well, with the arguments of
+    :func:`make_statistics` behind the first.
+    """
 
     def __call__(
-        self, moments: StreamingMoments, variables: TransitionVariables, previous: CausalGraph | None = None
+        self, statistics: Any, variables: TransitionVariables, previous: CausalGraph | None = None
     ) -> CausalGraph: ...
 
 
-DISCOVERY_METHODS: dict[str, type] = {"notears": Notears}
+DISCOVERY_METHODS: dict[str, type] = {"notears": Notears, "partial_r2": PartialR2}
 
 
 def make_discovery(method: str | Callable[..., CausalGraph], **kwargs: Any) -> DiscoveryMethod:
@@ -41,3 +68,36 @@ def make_discovery(method: str | Callable[..., CausalGraph], **kwargs: Any) -> D
     if unknown:
         raise ValueError(f"unknown arguments {unknown} for discovery method {method!r}, accepted are {accepted}")
     return DISCOVERY_METHODS[method](**kwargs)
+
+
+def make_statistics(
+    method: DiscoveryMethod, variables: TransitionVariables, half_life: float | None = None, window: int | None = None
+) -> Statistics:
+    """
+    :param method: The method that will read the statistics
+    :param variables: Names and order of the variables
+    :param half_life: Number of new rows after which an old row weighs half; None weighs all alike
+    :param window: Number of newest rows that are kept; None keeps all
+    :return: statistics without any rows
+    """
+    if hasattr(method, "make_statistics"):
+        return method.make_statistics(variables, half_life, window)
+    return StreamingMoments(variables.n_variables, half_life, variables.names, window)
+
+
+def discover(
+    method: str | Callable[..., CausalGraph], rows: npt.ArrayLike, variables: TransitionVariables, **kwargs: Any
+) -> CausalGraph:
+    """
+    Find the graph of recorded transitions, in one call.
+
+    :param method: A key of ``DISCOVERY_METHODS``, or a callable
+    :param rows: Transitions ``[s, a, s', r]``, see :meth:`TransitionVariables.stack`, shape (N, 2 n + d + 1)
+    :param variables: Names and order of the variables
+    :param kwargs: Arguments of the method's constructor
+    :return: the graph
+    """
+    chosen = make_discovery(method, **kwargs)
+    statistics = make_statistics(chosen, variables)
+    statistics.update(rows)
+    return chosen(statistics, variables)

@@ -4,84 +4,23 @@ from typing import NamedTuple
 
 import numpy as np
 
+from sb3_causalgdp.causal.degenerate import find_degeneracy, variance_inflation
+from sb3_causalgdp.causal.discovery.acyclic import notears, without_cycles
+from sb3_causalgdp.causal.discovery.lasso import least_squares_gram, solve_lasso_gram
 from sb3_causalgdp.causal.graph import CausalGraph
+from sb3_causalgdp.causal.jackknife import jackknife_error
 from sb3_causalgdp.causal.moments import StreamingMoments
 from sb3_causalgdp.causal.variables import TransitionVariables
 
 
-class LassoSolution(NamedTuple):
-    """Weights of shape (p, m), iterations done, and whether every column's KKT residual met the tolerance."""
+class _Part(NamedTuple):
+    """Some rows of the graph: those of the m targets, from p inputs."""
 
-    weights: np.ndarray
-    iterations: int
-    converged: bool
-
-
-def solve_lasso_gram(
-    gram: np.ndarray,
-    cross: np.ndarray,
-    sparsity: float,
-    initial: np.ndarray | None = None,
-    max_iterations: int = 20_000,
-    tolerance: float = 1e-5,
-) -> LassoSolution:
-    """
-    Minimise ``1/2 w^T G w - c^T w + sparsity ||w||_1`` for m targets at once, each with momentum of its own.
-
-    FISTA (Beck and Teboulle, 2009) with the gradient restart of O'Donoghue and Candes (2015). Stops when the KKT residual
-    (the largest violation of the optimality conditions) is at most ``tolerance`` times the target's largest \\|c\\|.
-
-    :param gram: G, second moments of the inputs, shape (p, p), positive semi-definite
-    :param cross: c, cross moments of inputs and targets, shape (p, m)
-    :param sparsity: Weight of the L1 norm, not negative
-    :param initial: Start, shape (p, m); zeros by default
-    :param max_iterations: Upper limit of the iterations
-    :param tolerance: Largest relative KKT residual
-    :return: the solution; one that did not converge is returned as it is
-    """
-    weights = np.zeros_like(cross) if initial is None else np.array(initial, dtype=np.float64)
-    curvature = np.linalg.eigvalsh(gram)[-1]
-    step = 1.0 / curvature if curvature > 0 else 0.0
-    limit = tolerance * np.abs(cross).max(axis=0)
-
-    # Work on the columns that are still open; products with G are carried along, so an iteration costs one of them
-    columns = np.arange(cross.shape[1])
-    current, current_product = weights, gram @ weights
-    ahead, ahead_product = current, current_product
-    momentum = np.ones(len(columns))
-    iteration = 0
-    while True:
-        still_open = _kkt_residual(current, current_product - cross[:, columns], sparsity) > limit[columns]
-        if not still_open.all():
-            weights[:, columns] = current
-            columns, momentum = columns[still_open], momentum[still_open]
-            current, current_product = current[:, still_open], current_product[:, still_open]
-            ahead, ahead_product = ahead[:, still_open], ahead_product[:, still_open]
-        if len(columns) == 0 or iteration >= max_iterations:
-            break
-        iteration += 1
-        new = _soft_threshold(ahead - step * (ahead_product - cross[:, columns]), step * sparsity)
-        new_product = gram @ new
-        uphill = ((ahead - new) * (new - current)).sum(axis=0) > 0
-        next_momentum = np.where(uphill, 1.0, (1.0 + np.sqrt(1.0 + 4.0 * momentum**2)) / 2.0)
-        inertia = np.where(uphill, 0.0, (momentum - 1.0) / next_momentum)
-        ahead = new + inertia * (new - current)
-        ahead_product = new_product + inertia * (new_product - current_product)
-        current, current_product, momentum = new, new_product, next_momentum
-    weights[:, columns] = current
-    return LassoSolution(weights, iteration, len(columns) == 0)
-
-
-def _soft_threshold(values: np.ndarray, threshold: float) -> np.ndarray:
-    return np.sign(values) * np.maximum(np.abs(values) - threshold, 0.0)
-
-
-def _kkt_residual(weights: np.ndarray, gradient: np.ndarray, sparsity: float) -> np.ndarray:
-    """Largest violation of the optimality conditions per column, shape (m,)."""
-    violation = np.where(
-        weights == 0, np.maximum(np.abs(gradient) - sparsity, 0.0), np.abs(gradient + sparsity * np.sign(weights))
-    )
-    return violation.max(axis=0)
+    weights: np.ndarray  # (m, p)
+    masks: np.ndarray  # (m, p)
+    r_squared: np.ndarray  # (m,)
+    standard_errors: np.ndarray | None  # (m, p)
+    groups: tuple[tuple[int, ...], ...]
 
 
 class Notears:
@@ -92,16 +31,28 @@ class Notears:
     Minimises ``1/2 tr((I - W)^T S (I - W)) + sparsity ||W||_1`` with S the second moments. Every graph of these edges is
     acyclic, so NOTEARS' constraint h(W) = 0 holds identically and the problem is convex: one Lasso per target.
 
+    With ``instantaneous``, edges s'_k -> s'_j are estimated as well, and there h(W) = 0 binds: NOTEARS on what (s_t, a_t)
+    leaves of s_{t+1} finds their weights B, and a Lasso of (I - B) s_{t+1} on (s_t, a_t) finds the direct weights A. The graph
+    holds the effects over all paths, ``(I - B)^{-1} A``: those are what a model of s_{t+1} given (s_t, a_t) alone needs. B itself
+    is left in the attribute ``instantaneous_weights``.
+
     A weight w (in standardised units) becomes a mask by one map: 0 where \\|w\\| < ``edge_threshold``, otherwise
     ``w^2 / (w^2 + mask_scale^2)``, which is half at \\|w\\| = ``mask_scale`` and, by default, 0.90 at 0.15 and 0.99 at 0.5.
+    Linearly dependent causes share a mask, the largest among them.
 
-    :param sparsity: Weight of the L1 norm, not negative; in units of a correlation when ``standardize``
+    Standard errors come from moments of at least two blocks (``StreamingMoments(n_blocks=8)``), by a jackknife that takes one
+    Newton step from the solution, at its support and signs; that of a closed edge is the error of what the L1 norm set to 0.
+
+    :param sparsity: Weight of the L1 norm, not negative; in units of a correlation when ``standardize``. 0 is least squares,
+        which has a closed form
     :param edge_threshold: Smallest \\|w\\| of an open edge, not negative
     :param mask_scale: The \\|w\\| at which a mask is one half, positive
     :param max_iterations: Upper limit of the solver's iterations
     :param tolerance: Largest KKT residual, relative to the target's largest second moment with an input
     :param standardize: Solve on the correlation matrix. False solves on the covariance, as the original does, where the
-        variables' units decide what is sparse (Reisach et al., 2021, https://arxiv.org/abs/2102.13647)
+        variables' units decide what is sparse and, among simultaneous variables, what causes what (Reisach et al., 2021,
+        https://arxiv.org/abs/2102.13647)
+    :param instantaneous: Whether edges inside s_{t+1} are estimated; costs hundreds of matrix exponentials of size n
     """
 
     def __init__(
@@ -112,6 +63,7 @@ class Notears:
         max_iterations: int = 20_000,
         tolerance: float = 1e-5,
         standardize: bool = True,
+        instantaneous: bool = False,
     ) -> None:
         for name, number, zero_allowed in (
             ("sparsity", sparsity, True),
@@ -130,6 +82,9 @@ class Notears:
         self.max_iterations = max_iterations
         self.tolerance = tolerance
         self.standardize = standardize
+        self.instantaneous = instantaneous
+        self.instantaneous_weights: np.ndarray | None = None
+        """Of the last graph: row j holds the direct weights of s'_k on s'_j in standardised units, without cycles, (n, n)."""
 
     def __call__(
         self, moments: StreamingMoments, variables: TransitionVariables, previous: CausalGraph | None = None
@@ -147,21 +102,24 @@ class Notears:
         n_states, n_inputs = variables.n_states, variables.n_states + variables.n_actions
         now = np.arange(n_inputs)
         after = np.concatenate([np.arange(variables.next_state.start, variables.next_state.stop), now[variables.action]])
-        start = np.zeros((n_states + 1, n_inputs)) if previous is None else previous.weights
-        weights = np.concatenate(
-            [
-                self._weights(moments, inputs=now, targets=after[:n_states], initial=start[:-1]),
-                self._weights(moments, inputs=after, targets=np.array([variables.reward]), initial=start[-1:]),
-            ]
-        )
-        return CausalGraph.from_matrices(
+        start = np.zeros((n_states + 1, n_inputs)) if previous is None else previous.effects
+        problem = _Standardised(moments, self.standardize)
+        dynamics = self._solve(problem, now, after[:n_states], start[:-1], self.instantaneous)
+        reward = self._solve(problem, after, np.array([variables.reward]), start[-1:])
+        known = dynamics.standard_errors is not None and reward.standard_errors is not None
+        names = np.array(variables.names)
+        return CausalGraph(
             variables,
-            self.mask(weights),
-            weights,
+            np.concatenate([dynamics.masks, reward.masks]),
+            np.concatenate([dynamics.weights, reward.weights]),
             method="notears",
             n_samples=moments.n_samples,
+            standard_errors=np.concatenate([dynamics.standard_errors, reward.standard_errors]) if known else None,
+            r_squared=np.concatenate([dynamics.r_squared, reward.r_squared]),
+            action_vif=variance_inflation(problem.correlation[:n_inputs, :n_inputs])[n_states:],
             found_at=datetime.now(timezone.utc).isoformat(timespec="seconds"),
-            constant_variables=tuple(np.array(variables.names)[moments.constant].tolist()),
+            constant_variables=tuple(names[moments.constant].tolist()),
+            duplicated_variables=tuple(tuple(names[sorted(group)].tolist()) for group in dynamics.groups),
         )
 
     def mask(self, weights: np.ndarray) -> np.ndarray:
@@ -181,29 +139,109 @@ class Notears:
         if previous is not None and previous.variables != variables:
             raise ValueError(f"previous must be over {variables.names}, got {previous.variables.names}")
 
-    def _weights(self, moments: StreamingMoments, inputs: np.ndarray, targets: np.ndarray, initial: np.ndarray) -> np.ndarray:
+    def _solve(
+        self,
+        problem: "_Standardised",
+        inputs: np.ndarray,
+        targets: np.ndarray,
+        initial: np.ndarray,
+        instantaneous: bool = False,
+    ) -> _Part:
         """
         :param inputs: Columns of the p possible causes
         :param targets: Columns of the m effects
         :param initial: Start in standardised units, shape (m, p)
-        :return: weights in standardised units, shape (m, p)
+        :param instantaneous: Whether the targets may cause each other
         """
-        moving = ~moments.constant
-        deviation = np.where(moving, moments.standard_deviation(), 1.0)
-        scale = np.ones_like(deviation) if self.standardize else deviation
-        second_moments = moments.correlation() * np.outer(scale, scale)
-        to_standardised = np.outer(1.0 / scale[targets], scale[inputs])
-        allowed = np.outer(moving[targets], moving[inputs])
-        solution = solve_lasso_gram(
-            second_moments[np.ix_(inputs, inputs)],
-            second_moments[np.ix_(inputs, targets)],
-            self.sparsity,
-            (initial * allowed / to_standardised).T,
-            self.max_iterations,
-            self.tolerance,
-        )
+        degeneracy = find_degeneracy(problem.correlation[np.ix_(inputs, inputs)])
+        moves = np.flatnonzero(problem.moving[targets])
+        free, targets = inputs[degeneracy.kept], targets[moves]
+        gram, cross = problem.second_moments(free, free), problem.second_moments(free, targets)
+        among = np.zeros((len(targets), len(targets)))
+        if instantaneous:
+            among = self._among(problem.second_moments(targets, targets), gram, cross)
+            self.instantaneous_weights = np.zeros((len(initial), len(initial)))
+            self.instantaneous_weights[np.ix_(moves, moves)] = among * problem.to_standardised(targets, targets)
+        through = np.linalg.inv(np.eye(len(targets)) - among)
+        units = problem.to_standardised(targets, free)
+        start = np.linalg.solve(through, initial[np.ix_(moves, degeneracy.kept)] / units)
+        direct = self._lasso(gram, cross @ np.linalg.inv(through).T, start)
+        chosen = np.ix_(moves, degeneracy.kept)
+        weights, r_squared = np.zeros_like(initial), np.zeros(len(initial))
+        weights[chosen] = total = (through @ direct) * units
+        r_squared[moves] = problem.r_squared(free, targets, total)
+        errors = None
+        if not instantaneous and (changes := problem.jackknife(free, targets, direct)) is not None:
+            errors = np.zeros_like(initial)
+            errors[chosen] = changes * units
+        for variable, (stand_in, sign) in degeneracy.stand_in.items():
+            weights[:, variable] = sign * weights[:, stand_in]
+            if errors is not None:
+                errors[:, variable] = errors[:, stand_in]
+        return _Part(weights, degeneracy.share(self.mask(weights)), r_squared, errors, degeneracy.groups)
+
+    def _lasso(self, gram: np.ndarray, cross: np.ndarray, initial: np.ndarray) -> np.ndarray:
+        solution = solve_lasso_gram(gram, cross, self.sparsity, initial.T, self.max_iterations, self.tolerance)
         if not solution.converged:
             warnings.warn(
-                f"NOTEARS stopped at max_iterations={self.max_iterations} before tolerance={self.tolerance:g}", stacklevel=3
+                f"NOTEARS stopped at max_iterations={self.max_iterations} before tolerance={self.tolerance:g}", stacklevel=4
             )
-        return solution.weights.T * to_standardised
+        return solution.weights.T
+
+    def _among(self, target_moments: np.ndarray, gram: np.ndarray, cross: np.ndarray) -> np.ndarray:
+        """Weights among the targets, from the second moments of what the inputs leave of them, shape (m, m)."""
+        left = target_moments - cross.T @ least_squares_gram(gram, cross)
+        return without_cycles(notears((left + left.T) / 2.0, self.sparsity), self.edge_threshold)
+
+
+class _Standardised:
+    """Second moments in the units in which the problem is solved: all with deviation 1, or the variables' own."""
+
+    def __init__(self, moments: StreamingMoments, standardize: bool) -> None:
+        self.moments = moments
+        self.moving = ~moments.constant
+        self.correlation = moments.correlation()
+        self.deviation = np.where(self.moving, moments.standard_deviation(), 1.0)
+        self.scale = np.ones_like(self.deviation) if standardize else self.deviation
+
+    def second_moments(self, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
+        return self.correlation[np.ix_(rows, columns)] * np.outer(self.scale[rows], self.scale[columns])
+
+    def to_standardised(self, targets: np.ndarray, inputs: np.ndarray) -> np.ndarray:
+        """Factors that bring weights into standardised units, shape (m, p)."""
+        return np.outer(1.0 / self.scale[targets], self.scale[inputs])
+
+    def r_squared(self, inputs: np.ndarray, targets: np.ndarray, weights: np.ndarray) -> np.ndarray:
+        """
+        :param weights: In standardised units, shape (m, p)
+        :return: 1 - residual variance / variance, shape (m,)
+        """
+        twice_cross = 2.0 * self.correlation[np.ix_(targets, inputs)] - weights @ self.correlation[np.ix_(inputs, inputs)]
+        return np.clip((weights * twice_cross).sum(axis=1), 0.0, 1.0)
+
+    def jackknife(self, inputs: np.ndarray, targets: np.ndarray, weights: np.ndarray) -> np.ndarray | None:
+        """
+        :param weights: Solution in the problem's units, shape (m, p)
+        :return: standard errors of the weights, shape (m, p); None when there are not two blocks
+        """
+        parts = self.moments.leave_one_out()
+        if not parts:
+            return None
+        inverse_scale = self.scale / self.deviation
+        columns = np.concatenate([inputs, targets])
+        residual_of = np.hstack([weights, -np.eye(len(targets))])
+        everything = self.second_moments(columns, columns)
+        gram = everything[: len(inputs), : len(inputs)]
+        gradients = np.empty((len(parts), *weights.shape))
+        for gradient, (rest, _) in zip(gradients, parts, strict=True):
+            factor = inverse_scale[columns]
+            covariance = rest.covariance()[np.ix_(columns, columns)] * np.outer(factor, factor)
+            gradient[:] = residual_of @ (covariance - everything)[:, : len(inputs)]
+        changes = np.zeros_like(gradients)
+        for target, row in enumerate(weights):
+            support, closed = np.flatnonzero(row), np.flatnonzero(row == 0.0)
+            slopes = gradients[:, target].T
+            changes[:, target, closed] = -(slopes[closed] / np.diagonal(gram)[closed, None]).T
+            if len(support):
+                changes[:, target, support] = -least_squares_gram(gram[np.ix_(support, support)], slopes[support]).T
+        return jackknife_error(weights, list(weights + changes), [share for _, share in parts])

@@ -1,0 +1,274 @@
+"""Find the causal graph of recorded transitions from the command line: ``python -m sb3_causalgdp.causal --help``."""
+
+import argparse
+import ast
+import json
+import sys
+import time
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+
+from sb3_causalgdp.causal.discovery import DISCOVERY_METHODS, make_discovery, make_statistics
+from sb3_causalgdp.causal.discovery.partial_r2 import CONFOUNDED_VIF
+from sb3_causalgdp.causal.graph import CausalGraph
+from sb3_causalgdp.causal.sources import BATCH_ROWS, TransitionSource, open_source
+
+THRESHOLD = 0.5  # of the masks that the summary lists
+SHOWN_EDGES = 40
+SHOWN_VALUES = 8
+SHOWN_GROUPS = 20
+
+
+def make_parser() -> argparse.ArgumentParser:
+    """
+    :return: the command line's parser
+    """
+    parser = argparse.ArgumentParser(
+        prog="python -m sb3_causalgdp.causal",
+        usage="%(prog)s DATASET_OR_BUFFER [options]",
+        description="Find the causal graph of recorded transitions with continuous actions, and print what it says.",
+        epilog="A .pkl file is unpickled, which can execute code: open your own files only.",
+    )
+    add = parser.add_argument
+    add(
+        "source",
+        metavar="DATASET_OR_BUFFER",
+        help="id of a Minari dataset, a replay buffer from model.save_replay_buffer (.pkl), or an .npz file of the arrays "
+        "observations, actions, next_observations and rewards",
+    )
+    add(
+        "--method", default="partial_r2", help=f"discovery method, one of {', '.join(sorted(DISCOVERY_METHODS))} (%(default)s)"
+    )
+    add(
+        "--method-kwargs", nargs="+", default=[], metavar="KEY=VALUE", help="arguments of the method, or a JSON object of them"
+    )
+    add("--plot", metavar="FILE", help="image to draw, such as graph.png")
+    add("--json", metavar="FILE", help="file for the whole graph, which CausalGraph.load reads")
+    add("--window", type=_positive, metavar="N", help="keep the newest N transitions only")
+    add("--half-life", type=_positive, metavar="N", help="number of transitions after which an old one weighs half")
+    add("--max-rows", type=_positive, metavar="N", help="read at most N transitions, spread evenly over all")
+    add("--download", action="store_true", help="download a Minari dataset that is not on this machine")
+    add("--quiet", action="store_true", help="no progress bar and no summary")
+    return parser
+
+
+def _positive(text: str) -> int:
+    try:
+        number = int(text.replace("_", ""))
+    except ValueError:
+        number = 0
+    if number < 1:
+        raise argparse.ArgumentTypeError(f"must be an integer of at least 1, got {text!r}")
+    return number
+
+
+def parse_kwargs(items: Sequence[str]) -> dict[str, Any]:
+    """
+    :param items: Each ``key=value``, or a JSON object
+    :return: the arguments by name; values are read as JSON, else as Python, else they are strings
+    :raises ValueError: on anything else
+    """
+    kwargs: dict[str, Any] = {}
+    for item in items:
+        if item.lstrip().startswith("{"):
+            try:
+                kwargs.update(json.loads(item))
+            except json.JSONDecodeError as error:
+                raise ValueError(f"--method-kwargs: {item!r} is no JSON object: {error}") from error
+        else:
+            key, equals, value = item.partition("=")
+            if not (equals and key.isidentifier()):
+                raise ValueError(f"--method-kwargs must be key=value or a JSON object, got {item!r}")
+            kwargs[key] = _value_of(value)
+    return kwargs
+
+
+def _value_of(text: str) -> Any:
+    for parse in (json.loads, ast.literal_eval):
+        try:
+            return parse(text)
+        except (ValueError, SyntaxError):
+            continue
+    return text
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """
+    Run the command line.
+
+    :param argv: Its arguments, by default those of the process
+    """
+    parser = make_parser()
+    arguments = parser.parse_args(argv)
+    try:
+        run(arguments)
+    except (ValueError, OSError, ImportError) as error:
+        parser.error(" ".join(str(error).split()))
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """
+    Read, discover, print and write.
+
+    :param arguments: What the parser made
+    :raises ValueError: on what the user got wrong
+    """
+    _check_plot(arguments.plot)
+    kwargs = parse_kwargs(arguments.method_kwargs)
+    with _as_value_error("--method-kwargs"):
+        method = make_discovery(arguments.method, **kwargs)
+    start = time.perf_counter()
+    source = open_source(arguments.source, download=arguments.download, max_rows=arguments.max_rows)
+    with _as_value_error("--method-kwargs"):
+        statistics = make_statistics(method, source.variables, arguments.half_life, arguments.window)
+    if source.n_rows == 0:
+        raise ValueError(f"{source.name} holds no transitions")
+    # Rows of one batch are weighted alike
+    batch_rows = BATCH_ROWS if arguments.half_life is None else min(BATCH_ROWS, -(-arguments.half_life // 10))
+    feed(statistics, source, batch_rows, arguments.quiet)
+    read = time.perf_counter()
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        graph = method(statistics, source.variables)
+    found = time.perf_counter()
+    if arguments.json is not None:
+        graph.save(arguments.json)
+    if not arguments.quiet:
+        print(summary_of(graph, source))
+        print(f"time: {found - start:.1f} s ({read - start:.1f} s reading, {found - read:.1f} s discovery)")
+    for warning in caught:
+        print(f"warning: {warning.message}", file=sys.stderr)
+    if arguments.plot is not None:
+        graph.plot(arguments.plot)
+
+
+def _check_plot(path: str | None) -> None:
+    """Before anything is read, so that a missing package or a wrong suffix costs no time."""
+    if path is not None:
+        from sb3_causalgdp.causal import plots
+
+        plots._check_suffix(path)
+
+
+@contextmanager
+def _as_value_error(argument: str) -> Iterator[None]:
+    """Arguments of a wrong type are the user's mistake, too."""
+    try:
+        yield
+    except TypeError as error:
+        raise ValueError(f"{argument}: {error}") from error
+
+
+def feed(statistics: Any, source: TransitionSource, batch_rows: int = BATCH_ROWS, quiet: bool = False) -> None:
+    """
+    Hand all rows of a source to the statistics of a method.
+
+    :param statistics: What ``make_statistics`` made
+    :param source: Where the rows come from; read again if the statistics ask for it
+    :param batch_rows: Number of rows at a time
+    :param quiet: Whether to show no progress bar
+    :raises ValueError: on rows that are not finite; the message says which
+    """
+    n_read = 0
+    with _progress("reading", source.n_rows, quiet) as advance:
+        for rows in source.batches(batch_rows):
+            _check_finite(rows, n_read, source)
+            statistics.update(rows)
+            n_read += len(rows)
+            advance(len(rows))
+    if getattr(statistics, "wants_history", False):
+        statistics.restart()
+        with _progress("reading again", source.n_rows, quiet) as advance:
+            for rows in source.batches(batch_rows):
+                statistics.refill(rows)
+                advance(len(rows))
+
+
+def _check_finite(rows: np.ndarray, n_read: int, source: TransitionSource) -> None:
+    bad = ~np.isfinite(rows)
+    if bad.any():
+        row = int(bad.any(axis=1).argmax())
+        names = ", ".join(np.array(source.variables.names)[bad[row]])
+        raise ValueError(f"{source.name}: transition {n_read + row} is NaN or infinite in {names}")
+
+
+@contextmanager
+def _progress(label: str, n_rows: int, quiet: bool) -> Iterator[Callable[[int], object]]:
+    """Gives what to call with each batch's number of rows."""
+    try:
+        from tqdm import tqdm
+    except ImportError:
+        yield lambda n_rows: None
+        return
+    # None: no bar where there is no terminal
+    disable = True if quiet else None
+    with tqdm(total=n_rows, desc=label, unit=" rows", unit_scale=True, leave=False, disable=disable) as bar:
+        yield bar.update
+
+
+# Summary ----------------------------------------------------------------------------------------------------------------
+
+
+def summary_of(graph: CausalGraph, source: TransitionSource) -> str:
+    """
+    :param graph: The graph
+    :param source: What it was found from
+    :return: the edges and what limits them, in lines for a terminal
+    """
+    variables = source.variables
+    part = "" if source.n_rows == source.n_stored else f" of {source.n_stored:,}"
+    lines = [
+        f"{source.name}: {source.n_rows:,}{part} transitions, {variables.n_states} states, {variables.n_actions} actions",
+        *_edge_lines(graph),
+    ]
+    if graph.r_squared is not None:
+        effects = (*variables.next_state_names, "reward")
+        lines.append(f"R^2: {_extreme_values(effects, graph.r_squared, 'lowest')}")
+    if graph.action_vif is not None:
+        shown = _extreme_values(variables.action_names, graph.action_vif, "highest")
+        lines.append(f"variance inflation (over {CONFOUNDED_VIF:g}: the states almost determine the action): {shown}")
+    if graph.constant_variables:
+        lines.append(f"constant, without edges: {_shortened(graph.constant_variables)}")
+    if graph.duplicated_variables:
+        groups = [" = ".join(group) for group in graph.duplicated_variables]
+        lines.append(f"linearly dependent, share their masks: {_shortened(groups)}")
+    return "\n".join(lines)
+
+
+def _edge_lines(graph: CausalGraph) -> list[str]:
+    edges = [edge for edge in graph.edges() if edge.mask > THRESHOLD]
+    edges.sort(key=lambda edge: (-edge.mask, -abs(edge.strength)))
+    shown = edges[:SHOWN_EDGES]
+    lines = [f"{graph.method}: {len(edges)} of {graph.masks.size} possible edges have a mask above {THRESHOLD:g}"]
+    width = max((len(edge.cause) for edge in shown), default=0)
+    for edge in shown:
+        error = "" if np.isnan(edge.standard_error) else f" +- {edge.standard_error:<7.2g}"
+        lines.append(f"  {edge.mask:.2f}  {edge.strength:+.2f}{error}  {edge.cause:>{width}} -> {edge.effect}")
+    if shown:
+        lines.insert(1, "  mask, effect in standard deviations, edge")
+    if len(edges) > len(shown):
+        lines.append(f"  and {len(edges) - len(shown)} more (--json FILE has them all)")
+    return lines
+
+
+def _extreme_values(names: Sequence[str], values: np.ndarray, which: str) -> str:
+    """All values, or the few that say most."""
+    order = np.argsort(values if which == "lowest" else -values, kind="stable")[:SHOWN_VALUES]
+    if len(values) <= SHOWN_VALUES:
+        order, remark = np.arange(len(values)), ""
+    else:
+        remark = f" (the {which} {SHOWN_VALUES} of {len(values)})"
+    return ", ".join(f"{names[i]} {values[i]:.3g}" for i in order) + remark
+
+
+def _shortened(names: Sequence[str]) -> str:
+    more = f" and {len(names) - SHOWN_GROUPS} more" if len(names) > SHOWN_GROUPS else ""
+    return ", ".join(names[:SHOWN_GROUPS]) + more
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,351 @@
+"""Where recorded transitions come from: Minari datasets, saved replay buffers of SB3, and arrays, read in batches of rows."""
+
+import math
+import os
+import pickle
+import re
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+from zipfile import BadZipFile
+
+import numpy as np
+from gymnasium import spaces
+
+from sb3_causalgdp.causal.variables import TransitionVariables
+
+OFFLINE_HINT = 'pip install "sb3_causalgdp[offline]"'
+MINARI_ID = re.compile(r"[-\w]+(/[-\w]+)*-v\d+")
+ARRAYS = ("observations", "actions", "next_observations", "rewards")
+BUFFER_ATTRIBUTES = (
+    *("observations", "actions", "rewards", "dones", "pos", "full", "buffer_size", "n_envs"),
+    *("optimize_memory_usage", "observation_space", "action_space"),
+)
+BATCH_ROWS = 4096
+
+
+class SourceError(ValueError):
+    """The source is missing, or does not hold transitions that discovery can use."""
+
+
+class FlatSpace:
+    """
+    The numbers of an observation space in the order of gymnasium's ``flatten``, for many observations at once.
+
+    Names are ``obs[i]``, for dictionaries ``key[i]`` and ``outer.inner[i]``; discrete parts are one-hot.
+
+    :param space: Observation space, may be nested
+    :raises SourceError: when a part of it is an image, or has no fixed number of numbers
+    """
+
+    def __init__(self, space: spaces.Space) -> None:
+        self._leaves = list(_leaves(space))
+        names: list[str] = []
+        for path, leaf in self._leaves:
+            name = ".".join(map(str, path))
+            if not path or isinstance(path[0], int) or name == "action":
+                # "action[0]" would be the name of an action as well
+                name = f"obs[{name}]" if name else "obs"
+            _check_leaf(name, leaf)
+            names += [f"{name}[{index}]" for index in range(spaces.flatdim(leaf))]
+        self.names = tuple(names)
+
+    def __call__(self, observations: Any) -> np.ndarray:
+        """
+        :param observations: N observations: an array, or arrays in dictionaries and tuples like those of the space
+        :return: shape (N, n)
+        """
+        parts = []
+        for path, leaf in self._leaves:
+            values = observations
+            for key in path:
+                values = values[key]
+            parts.append(_flat_leaf(leaf, np.asarray(values)))
+        return np.concatenate(parts, axis=1)
+
+
+def _leaves(space: spaces.Space, path: tuple[str | int, ...] = ()) -> Iterator[tuple[tuple[str | int, ...], spaces.Space]]:
+    """The parts of a space that are not dictionaries or tuples, and the keys that lead there."""
+    if isinstance(space, spaces.Dict | spaces.Tuple):
+        named = space.spaces.items() if isinstance(space, spaces.Dict) else enumerate(space.spaces)
+        for key, part in named:
+            yield from _leaves(part, (*path, key))
+    else:
+        yield path, space
+
+
+def _check_leaf(name: str, leaf: spaces.Space) -> None:
+    if not isinstance(leaf, spaces.Box | spaces.MultiBinary | spaces.Discrete | spaces.MultiDiscrete):
+        raise SourceError(f"observations {name!r} cannot be flattened to numbers: {leaf}")
+    if isinstance(leaf, spaces.Box) and leaf.dtype == np.uint8 and len(leaf.shape) > 1:
+        raise _image_error(name, leaf.shape)
+
+
+def _image_error(name: str, shape: tuple[int, ...]) -> SourceError:
+    return SourceError(f"observations {name!r} are images of shape {shape}: pixels are no variables of a causal graph")
+
+
+def _flat_leaf(leaf: spaces.Space, values: np.ndarray) -> np.ndarray:
+    """Shape (N, flatdim)."""
+    if isinstance(leaf, spaces.Discrete):
+        counts, starts = np.array([leaf.n]), np.array([leaf.start])
+    elif isinstance(leaf, spaces.MultiDiscrete):
+        counts, starts = leaf.nvec.ravel(), np.ravel(leaf.start)
+    else:
+        return _as_rows(values)
+    columns = values.reshape(len(values), len(counts)) - starts
+    return np.concatenate([columns[:, [i]] == np.arange(count) for i, count in enumerate(counts)], axis=1)
+
+
+def _as_rows(values: np.ndarray) -> np.ndarray:
+    return values.reshape(len(values), math.prod(values.shape[1:]))
+
+
+def _action_names(space: spaces.Space) -> tuple[str, ...]:
+    if not isinstance(space, spaces.Box):
+        raise SourceError(f"continuous actions are needed (a Box), got {space}")
+    return tuple(f"action[{index}]" for index in range(spaces.flatdim(space)))
+
+
+class TransitionSource(ABC):
+    """
+    Recorded transitions that can be read in batches, as often as one likes.
+
+    :param name: What to call the source
+    :param variables: Names and order of the variables
+    :param n_stored: Number of transitions that it holds
+    :param max_rows: Read at most this many, spread evenly over all; None reads all
+    """
+
+    def __init__(self, name: str, variables: TransitionVariables, n_stored: int, max_rows: int | None = None) -> None:
+        if max_rows is not None and max_rows < 1:
+            raise ValueError(f"max_rows must be None or at least 1, got {max_rows!r}")
+        self.name = name
+        self.variables = variables
+        self.n_stored = n_stored
+        self.n_rows = n_stored if max_rows is None else min(n_stored, max_rows)
+
+    def batches(self, batch_rows: int = BATCH_ROWS) -> Iterator[np.ndarray]:
+        """
+        :param batch_rows: Number of rows of a batch; the last one may be shorter
+        :return: rows ``[s, a, s', r]`` in the order they were recorded, float64, shape (batch_rows, 2 n + d + 1)
+        """
+        waiting: list[np.ndarray] = []
+        n_waiting = 0
+        for part in self._chosen_rows(batch_rows):
+            waiting.append(part)
+            n_waiting += len(part)
+            if n_waiting >= batch_rows:
+                rows = np.concatenate(waiting)
+                n_whole = n_waiting - n_waiting % batch_rows
+                yield from (rows[first : first + batch_rows] for first in range(0, n_whole, batch_rows))
+                waiting, n_waiting = [rows[n_whole:]], n_waiting - n_whole
+        if n_waiting > 0:
+            yield np.concatenate(waiting)
+
+    def _chosen_rows(self, n_rows: int) -> Iterator[np.ndarray]:
+        if self.n_rows == self.n_stored:
+            yield from self._parts(n_rows)
+            return
+        chosen = np.linspace(0, self.n_stored - 1, self.n_rows).astype(np.int64)
+        first = 0
+        for part in self._parts(n_rows):
+            lower, upper = np.searchsorted(chosen, [first, first + len(part)])
+            yield part[chosen[lower:upper] - first]
+            first += len(part)
+
+    @abstractmethod
+    def _parts(self, n_rows: int) -> Iterator[np.ndarray]:
+        """All rows in their order, in parts of any length, ``n_rows`` at most where there is a choice."""
+
+
+class ReplayBufferSource(TransitionSource):
+    """
+    A replay buffer of SB3, or of its shape: one-step transitions straight from its arrays, oldest first.
+
+    SB3 stores actions scaled to [-1, 1] and observations as the environment gave them.
+
+    :param buffer: The buffer, of vectors or dictionaries of vectors, with any number of environments
+    :param name: What to call it
+    :param max_rows: Read at most this many transitions, spread evenly over all; None reads all
+    :raises SourceError: when it is not a replay buffer, actions are not continuous, or observations are images
+    """
+
+    def __init__(self, buffer: Any, name: str = "replay buffer", max_rows: int | None = None) -> None:
+        missing = [attribute for attribute in BUFFER_ATTRIBUTES if not hasattr(buffer, attribute)]
+        if missing:
+            kind = type(buffer).__name__
+            raise SourceError(f"{name} holds no replay buffer but a {kind}: save one with model.save_replay_buffer(path)")
+        self.buffer = buffer
+        self._flat = FlatSpace(buffer.observation_space)
+        variables = TransitionVariables(self._flat.names, _action_names(buffer.action_space))
+        n_positions = buffer.buffer_size if buffer.full else buffer.pos
+        if buffer.full and buffer.optimize_memory_usage:
+            n_positions -= 1  # the oldest observation has been overwritten
+        self._positions = np.arange(buffer.pos - n_positions, buffer.pos) % buffer.buffer_size
+        n_stored = n_positions * buffer.n_envs
+        if buffer.optimize_memory_usage:
+            n_stored = int(np.count_nonzero(buffer.dones[self._positions] == 0.0))
+        super().__init__(name, variables, n_stored, max_rows)
+
+    def _parts(self, n_rows: int) -> Iterator[np.ndarray]:
+        positions_per_part = max(1, n_rows // self.buffer.n_envs)
+        for first in range(0, len(self._positions), positions_per_part):
+            yield self._read(self._positions[first : first + positions_per_part])
+
+    def _read(self, positions: np.ndarray) -> np.ndarray:
+        buffer = self.buffer
+        if buffer.optimize_memory_usage:
+            after, next_positions = buffer.observations, (positions + 1) % buffer.buffer_size
+        else:
+            after, next_positions = buffer.next_observations, positions
+        rows = self.variables.stack(
+            self._states(buffer.observations, positions),
+            _as_rows(_all_environments(buffer.actions, positions)),
+            self._states(after, next_positions),
+            buffer.rewards[positions].reshape(-1),
+        )
+        if buffer.optimize_memory_usage:
+            # This buffer does not keep the last observation of an episode
+            rows = rows[buffer.dones[positions].reshape(-1) == 0.0]
+        return rows
+
+    def _states(self, observations: np.ndarray | dict[str, np.ndarray], positions: np.ndarray) -> np.ndarray:
+        if isinstance(observations, dict):
+            return self._flat({key: _all_environments(values, positions) for key, values in observations.items()})
+        return self._flat(_all_environments(observations, positions))
+
+
+def _all_environments(values: np.ndarray, positions: np.ndarray) -> np.ndarray:
+    """One row for each position and environment."""
+    return values[positions].reshape(len(positions) * values.shape[1], *values.shape[2:])
+
+
+class MinariSource(TransitionSource):
+    """
+    A Minari dataset, episode by episode; the last step of an episode has its true next observation.
+
+    :param dataset: The dataset
+    :param name: What to call it
+    :param max_rows: Read at most this many transitions, spread evenly over all; None reads all
+    :raises SourceError: when actions are not continuous, or observations are images
+    """
+
+    def __init__(self, dataset: Any, name: str = "dataset", max_rows: int | None = None) -> None:
+        self.dataset = dataset
+        self._flat = FlatSpace(dataset.observation_space)
+        variables = TransitionVariables(self._flat.names, _action_names(dataset.action_space))
+        super().__init__(name, variables, int(dataset.total_steps), max_rows)
+
+    def _parts(self, n_rows: int) -> Iterator[np.ndarray]:
+        for episode in self.dataset.iterate_episodes():
+            # T steps have T + 1 observations
+            states = self._flat(episode.observations)
+            yield self.variables.stack(states[:-1], _as_rows(np.asarray(episode.actions)), states[1:], episode.rewards)
+
+
+class ArraySource(TransitionSource):
+    """
+    N transitions in four arrays.
+
+    :param observations: s, shape (N, ...)
+    :param actions: a, shape (N, ...)
+    :param next_observations: s', of the shape of s
+    :param rewards: r, shape (N,) or (N, 1)
+    :param name: What to call them
+    :param max_rows: Read at most this many transitions, spread evenly over all; None reads all
+    :raises SourceError: when shapes do not fit, actions are not continuous, or observations are images
+    """
+
+    def __init__(
+        self,
+        observations: np.ndarray,
+        actions: np.ndarray,
+        next_observations: np.ndarray,
+        rewards: np.ndarray,
+        name: str = "arrays",
+        max_rows: int | None = None,
+    ) -> None:
+        given = dict(zip(ARRAYS, (observations, actions, next_observations, rewards), strict=True))
+        if len({values.shape[:1] for values in given.values()}) > 1 or rewards.ndim == 0:
+            shapes = {key: values.shape for key, values in given.items()}
+            raise SourceError(f"{name}: all arrays must have a row for each transition, got shapes {shapes}")
+        if observations.dtype == np.uint8 and observations.ndim > 2:
+            raise _image_error("observations", observations.shape[1:])
+        if not np.issubdtype(actions.dtype, np.floating):
+            raise SourceError(f"continuous actions are needed, got an array of {actions.dtype}")
+        self._arrays = [_as_rows(values) for values in given.values()]
+        names = [
+            tuple(f"{prefix}[{index}]" for index in range(values.shape[1]))
+            for prefix, values in zip(("obs", "action"), self._arrays[:2], strict=True)
+        ]
+        super().__init__(name, TransitionVariables(*names), len(rewards), max_rows)
+
+    def _parts(self, n_rows: int) -> Iterator[np.ndarray]:
+        for first in range(0, self.n_stored, n_rows):
+            yield self.variables.stack(*(values[first : first + n_rows] for values in self._arrays))
+
+
+def open_source(
+    path_or_id: str | os.PathLike[str], *, download: bool = False, max_rows: int | None = None
+) -> TransitionSource:
+    """
+    Open recorded transitions by name.
+
+    Unpickling a replay buffer can execute code: open your own files only.
+
+    :param path_or_id: A replay buffer that SB3's ``model.save_replay_buffer`` wrote (``.pkl``), arrays that ``numpy.savez``
+        wrote under the names ``observations``, ``actions``, ``next_observations`` and ``rewards`` (``.npz``), or the id of a
+        Minari dataset
+    :param download: Whether to download a Minari dataset that is not on this machine
+    :param max_rows: Read at most this many transitions, spread evenly over all; None reads all
+    :return: the source
+    :raises SourceError: when there is no such source, or discovery cannot use it
+    """
+    name, path = os.fspath(path_or_id), Path(path_or_id)
+    readers = {".pkl": _open_replay_buffer, ".npz": _open_arrays}
+    if not path.is_file() and Path(f"{name}.pkl").is_file():
+        path = Path(f"{name}.pkl")  # save_replay_buffer adds the suffix, too
+    if path.is_file():
+        if path.suffix not in readers:
+            raise SourceError(f"{name} is neither a saved replay buffer (.pkl) nor arrays (.npz)")
+        return readers[path.suffix](path, max_rows)
+    if path.suffix in readers or not MINARI_ID.fullmatch(name):
+        raise SourceError(f"no file {name!r}, and the id of a Minari dataset ends in -v and a number")
+    return _open_minari(name, download, max_rows)
+
+
+def _open_replay_buffer(path: Path, max_rows: int | None) -> TransitionSource:
+    try:
+        with path.open("rb") as file:
+            buffer = pickle.load(file)
+    except Exception as error:  # a broken pickle can raise anything
+        raise SourceError(f"{path} cannot be read as a replay buffer: {type(error).__name__}: {error}") from error
+    return ReplayBufferSource(buffer, str(path), max_rows)
+
+
+def _open_arrays(path: Path, max_rows: int | None) -> TransitionSource:
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = {name: file[name] for name in ARRAYS if name in file}
+    except (BadZipFile, EOFError, OSError, ValueError) as error:
+        raise SourceError(f"{path} cannot be read as arrays: {error}") from error
+    missing = [name for name in ARRAYS if name not in arrays]
+    if missing:
+        raise SourceError(f"{path} lacks the arrays {missing}: it needs {list(ARRAYS)}")
+    return ArraySource(**arrays, name=str(path), max_rows=max_rows)
+
+
+def _open_minari(dataset_id: str, download: bool, max_rows: int | None) -> TransitionSource:
+    try:
+        import minari
+    except ImportError as error:
+        raise SourceError(f"no file {dataset_id!r}, and a Minari dataset needs the package minari: {OFFLINE_HINT}") from error
+    try:
+        dataset = minari.load_dataset(dataset_id, download=download)
+    except FileNotFoundError as error:
+        raise SourceError(f"no Minari dataset {dataset_id!r} on this machine: ask for its download (--download)") from error
+    except Exception as error:  # of the network, of a server's library, or of a broken file
+        raise SourceError(f"the Minari dataset {dataset_id!r} cannot be loaded: {error}") from error
+    return MinariSource(dataset, dataset_id, max_rows)

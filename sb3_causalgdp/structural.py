@@ -1,0 +1,127 @@
+"""Between SB3's observations and the structural model's rows: normalisation, dictionaries, one observation or many."""
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from gymnasium import spaces
+from stable_baselines3.common.vec_env import VecNormalize
+
+from sb3_causalgdp.causal import StructuralModel, TransitionVariables
+from sb3_causalgdp.policies import CausalGDPPolicy
+
+Observations = np.ndarray | dict[str, np.ndarray]
+
+
+def make_structural_model(
+    policy: CausalGDPPolicy, variables: TransitionVariables, normalizer: VecNormalize | None = None
+) -> StructuralModel:
+    """
+    The policy's world model with the maps to the environment's units.
+
+    :param policy: The policy
+    :param variables: Names of its states and actions
+    :param normalizer: What normalised the observations and rewards that the world model has seen; its statistics are read now
+    :return: The structural model; for images its states are features, which have no other unit
+    :raises RuntimeError: If the world model has seen no data
+    """
+    if policy.world_model.n_batches == 0:
+        raise RuntimeError("The world model has not been trained: call learn() until after learning_starts, or train(), first")
+    assert isinstance(policy.action_space, spaces.Box)
+    low, high = policy.action_space.low.flatten(), policy.action_space.high.flatten()
+    if normalizer is None:
+        return StructuralModel(policy.world_model, variables, low, high)
+    offset, scale, clip = (0.0, 1.0, np.inf) if policy.has_image_state else _state_maps(policy, normalizer)
+    reward_scale = float(np.sqrt(normalizer.ret_rms.var + normalizer.epsilon)) if normalizer.norm_reward else 1.0
+    return StructuralModel(policy.world_model, variables, low, high, offset, scale, clip, reward_scale)
+
+
+def _state_maps(policy: CausalGDPPolicy, normalizer: VecNormalize) -> tuple[npt.ArrayLike, npt.ArrayLike, npt.ArrayLike]:
+    """Offset, scale and clip of each state variable."""
+    if not normalizer.norm_obs:
+        return 0.0, 1.0, np.inf
+    space = policy.observation_space
+    parts = space.spaces if isinstance(space, spaces.Dict) else {"": space}
+    columns = []
+    for key, part in parts.items():
+        size = spaces.flatdim(part)
+        statistics = normalizer.obs_rms.get(key) if isinstance(normalizer.obs_rms, dict) else normalizer.obs_rms
+        if statistics is None:
+            columns.append((np.zeros(size), np.ones(size), np.full(size, np.inf)))
+        else:
+            scale = np.sqrt(statistics.var + normalizer.epsilon)
+            columns.append((statistics.mean.flatten(), scale.flatten(), np.full(size, normalizer.clip_obs)))
+    offset, scale, clip = (np.concatenate(values) for values in zip(*columns, strict=True))
+    return offset, scale, clip
+
+
+def states_of(policy: CausalGDPPolicy, observation: Any, normalizer: VecNormalize | None = None) -> np.ndarray:
+    """
+    :param policy: The policy
+    :param observation: As the environment gives it, not normalised: one, a batch, or a list of them
+    :param normalizer: Normalises the observation where the state is its features
+    :return: The causal model's state in the environment's units, shape ``(n,)`` for one observation, else ``(batch, n)``
+    """
+    if isinstance(observation, (list, tuple)) and len(observation) > 0 and isinstance(observation[0], dict):
+        observation = {key: np.stack([one[key] for one in observation]) for key in observation[0]}
+    if not isinstance(observation, dict):
+        observation = np.asarray(observation)
+    if policy.has_image_state and normalizer is not None:
+        observation = normalizer.normalize_obs(observation)
+    policy.set_training_mode(False)
+    tensor, is_batch = policy.obs_to_tensor(observation)
+    states = policy.causal_state(tensor).cpu().numpy()
+    return states if is_batch else states[0]
+
+
+def actions_of(policy: CausalGDPPolicy, action: npt.ArrayLike) -> np.ndarray:
+    """
+    :param policy: The policy
+    :param action: One action of the environment, or a batch
+    :return: Flattened, shape ``(d,)`` for one action, else ``(batch, d)``
+    :raises ValueError: If the shape is not that of the action space
+    """
+    actions, shape = np.asarray(action, dtype=np.float64), policy.action_space.shape
+    assert shape is not None
+    if actions.shape == shape:
+        return actions.flatten()
+    if actions.shape[1:] != shape:
+        raise ValueError(f"Actions must have the shape {shape} or (batch, {', '.join(map(str, shape))}), got {actions.shape}")
+    return actions.reshape(len(actions), -1)
+
+
+class StatePolicy:
+    """
+    The policy's deterministic action at a state of the causal model.
+
+    :param policy: The policy; its observations must be boxes that are no images, whose states are the observations themselves
+    :param normalizer: Normalises the observations for it
+    :raises ValueError: If a state has no observation
+    """
+
+    def __init__(self, policy: CausalGDPPolicy, normalizer: VecNormalize | None = None) -> None:
+        space = policy.observation_space
+        parts = list(space.spaces.values()) if isinstance(space, spaces.Dict) else [space]
+        if policy.has_image_state or not all(isinstance(part, spaces.Box) for part in parts):
+            raise ValueError(f"The policy cannot act in predicted states: they do not make an observation of {space}")
+        self.policy = policy
+        self.normalizer = normalizer
+
+    def __call__(self, state: np.ndarray) -> np.ndarray:
+        """
+        :param state: In the environment's units, shape ``(n,)``
+        :return: Action of the environment, shape ``(d,)``
+        """
+        space = self.policy.observation_space
+        observation: Observations
+        if isinstance(space, spaces.Dict):
+            ends = np.cumsum([spaces.flatdim(part) for part in space.spaces.values()])
+            pieces = np.split(state, ends[:-1])
+            observation = {
+                key: piece.reshape(part.shape) for (key, part), piece in zip(space.spaces.items(), pieces, strict=True)
+            }
+        else:
+            observation = state.reshape(space.shape)
+        if self.normalizer is not None:
+            observation = self.normalizer.normalize_obs(observation)
+        return self.policy.predict(observation, deterministic=True)[0].flatten()  # type: ignore[arg-type]
