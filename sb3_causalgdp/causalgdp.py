@@ -229,7 +229,7 @@ class CausalGDP(OffPolicyAlgorithm):
         self.causal_window = causal_window
         # What is known of the causal structure, saved with the model
         self.causal_statistics: Statistics | None = None
-        self._statistics_made_by: tuple[Any, ...] | None = None
+        self._statistics_made_by: list[Any] | None = None
         self._causal_graph: CausalGraph | None = None
         self.causal_graph_history: list[CausalGraph] = []
         self._steps_since_refresh = 0
@@ -263,7 +263,7 @@ class CausalGDP(OffPolicyAlgorithm):
         # A callable that was saved is not the same object when it is loaded
         name = method if isinstance(method, str) else getattr(method, "__qualname__", type(method).__qualname__)
         forgetting = (self.causal_half_life, self.causal_window)
-        made_by = (name, self.causal_discovery_kwargs, *forgetting)
+        made_by = [name, self.causal_discovery_kwargs, *forgetting]  # a list, as it comes back from the zip
         if self.causal_statistics is None or self._statistics_made_by != made_by:
             # Another method, which load() may have brought, gathers anew from the replay buffer
             self.causal_statistics = make_statistics(self.discovery, self.transition_variables, *forgetting)

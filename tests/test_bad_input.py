@@ -218,10 +218,10 @@ def test_a_value_that_makes_no_sense_is_refused_at_once(argument, value):
 
 
 def test_arguments_of_the_discovery_method_are_checked_at_once():
-    with pytest.raises(ValueError, match=r"unknown arguments \['sparsty'\].*'sparsity'"):
-        make(causal_discovery_kwargs={"sparsty": 0.1})
-    with pytest.raises(ValueError, match="sparsity must be a finite number"):
-        make(causal_discovery_kwargs={"sparsity": -0.1})
+    with pytest.raises(ValueError, match=r"unknown arguments \['treshold'\].*'threshold'"):
+        make(causal_discovery_kwargs={"treshold": 0.1})
+    with pytest.raises(ValueError, match="threshold must be in"):
+        make(causal_discovery_kwargs={"threshold": -0.1})
 
 
 @pytest.mark.parametrize("net_arch", [[], [16, 8], [0]])

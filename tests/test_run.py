@@ -146,7 +146,7 @@ def test_bounds_of_the_actions_are_those_of_the_environment():
         {"guidance_covariance": "isotropic", "sampler": "ddim", "ddim_eta": 1.0, "noise_schedule": "cosine"},
         {"guidance_target": "reward", "noise_schedule": "linear", "diffusion_steps": 3},
         {"diffusion_steps": 1, "n_action_candidates": 1, "state_guidance_scale": 0.0},
-        {"causal_half_life": 50.0, "causal_discovery_kwargs": {"sparsity": 0.1}},
+        {"causal_half_life": 50.0, "causal_discovery_kwargs": {"threshold": 0.1}},
         {"denoising_weight": 0.0},
         {"eta": 0.0},
         {"max_q_backup": True, "n_steps": 2},
@@ -194,7 +194,7 @@ def test_the_policy_is_a_name_or_a_class(policy):
 
 def test_the_callers_dictionaries_are_left_as_they_were():
     policy_kwargs = {"net_arch": {"pi": [8], "qf": [4, 4]}, "optimizer_kwargs": {"weight_decay": 0.1}}
-    discovery_kwargs = {"sparsity": 0.05}
+    discovery_kwargs = {"threshold": 0.05}
     before = deepcopy((policy_kwargs, discovery_kwargs))
     model = learn(policy_kwargs=policy_kwargs, causal_discovery_kwargs=discovery_kwargs)
     assert (policy_kwargs, discovery_kwargs) == before

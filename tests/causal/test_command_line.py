@@ -1,0 +1,419 @@
+import os
+import pickle
+import subprocess
+import sys
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium import spaces
+from gymnasium.vector.utils import concatenate, create_empty_array
+from stable_baselines3 import SAC
+from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer, RolloutBuffer
+from stable_baselines3.common.save_util import save_to_pkl
+from stable_baselines3.her import HerReplayBuffer
+
+import sb3_causalgdp
+from sb3_causalgdp.causal import CausalGraph
+from sb3_causalgdp.causal.__main__ import feed, main, parse_kwargs
+from sb3_causalgdp.causal.discovery import make_discovery, make_statistics
+from sb3_causalgdp.causal.sources import (
+    ArraySource,
+    FlatSpace,
+    MinariSource,
+    ReplayBufferSource,
+    SourceError,
+    open_source,
+)
+
+# On datasets without an author and so on
+pytestmark = pytest.mark.filterwarnings("ignore::UserWarning:minari")
+
+BOX = spaces.Box(-1, 1, (2,), dtype=np.float32)
+GOALS = spaces.Dict({name: BOX for name in ("achieved_goal", "desired_goal", "observation")})
+
+
+def fill(buffer, n_steps):
+    """Adds steps of numbers that never repeat, five to an episode. Returns each step's rows, and whether it is the last."""
+    rows, ends = [], []
+
+    def observe(step):
+        values = step + 100.0 * np.arange(buffer.n_envs)[:, None] + np.array([0.0, 0.5])
+        if isinstance(buffer.observation_space, spaces.Dict):
+            return {key: values + 1000.0 * i for i, key in enumerate(buffer.observation_space.spaces)}
+        return values
+
+    def flat(observation):
+        return np.concatenate(list(observation.values()), axis=1) if isinstance(observation, dict) else observation
+
+    for step in range(n_steps):
+        first, done = 2.0 * step, step % 5 == 4
+        # Where the episode goes on, the next step starts where this one ends
+        after = first + (1.0 if done else 2.0)
+        actions, rewards = np.full((buffer.n_envs, 1), step / 7.0), step + np.arange(buffer.n_envs)
+        infos = [{"TimeLimit.truncated": False}] * buffer.n_envs
+        buffer.add(observe(first), observe(after), actions, rewards, np.full(buffer.n_envs, done), infos)
+        rows.append(np.column_stack([flat(observe(first)), actions, flat(observe(after)), rewards]))
+        ends.append(done)
+    return rows, ends
+
+
+def rows_of(source, batch_rows=7):
+    batches = list(source.batches(batch_rows))
+    assert all(len(rows) == batch_rows for rows in batches[:-1])
+    return np.concatenate(batches)
+
+
+def make_rows(n_rows, seed=0):
+    """Two states, one action; only the first state and the action cause the first, only the second the second."""
+    rng = np.random.default_rng(seed)
+    states, actions = rng.normal(size=(n_rows, 2)), rng.uniform(-1, 1, size=(n_rows, 1))
+    next_states = states * [0.8, 0.9] + np.column_stack([actions, np.zeros(n_rows)]) + 0.05 * rng.normal(size=(n_rows, 2))
+    return {
+        "observations": states,
+        "actions": actions,
+        "next_observations": next_states,
+        "rewards": -next_states[:, 0] + 0.05 * rng.normal(size=n_rows),
+    }
+
+
+@pytest.fixture
+def arrays(tmp_path):
+    path = tmp_path / "arrays.npz"
+    np.savez(path, **make_rows(600))
+    return path
+
+
+def error_of(capsys, *argv):
+    with pytest.raises(SystemExit) as stopped:
+        main([str(argument) for argument in argv])
+    assert stopped.value.code == 2
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    usage, error = printed.err.splitlines()
+    assert usage.startswith("usage: ")
+    return error
+
+
+# Replay buffers ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("n_envs", [1, 2])
+@pytest.mark.parametrize("n_steps", [13, 20, 33])
+@pytest.mark.parametrize(
+    "kind, space, kwargs",
+    [
+        (ReplayBuffer, BOX, {}),
+        (ReplayBuffer, BOX, {"optimize_memory_usage": True, "handle_timeout_termination": False}),
+        (NStepReplayBuffer, BOX, {"n_steps": 3}),
+        (DictReplayBuffer, GOALS, {}),
+        (HerReplayBuffer, GOALS, {"env": None}),
+    ],
+)
+def test_rows_of_a_saved_buffer(tmp_path, kind, space, kwargs, n_steps, n_envs):
+    buffer = kind(20 * n_envs, space, spaces.Box(-1, 1, (1,)), device="cpu", n_envs=n_envs, **kwargs)
+    rows, ends = fill(buffer, n_steps)
+    rows, ends = rows[-20:], ends[-20:]
+    if buffer.optimize_memory_usage:
+        overwritten = int(n_steps >= 20)
+        rows = [row for row, end in list(zip(rows, ends, strict=True))[overwritten:] if not end]
+    save_to_pkl(tmp_path / "buffer.pkl", buffer)
+    source = open_source(tmp_path / "buffer")
+    expected = np.concatenate(rows)
+    assert source.n_rows == len(expected)
+    np.testing.assert_allclose(rows_of(source), expected, rtol=1e-6)
+
+
+def test_names_are_those_of_the_model():
+    buffer = DictReplayBuffer(20, spaces.Dict({"action": BOX, "pose": BOX}), spaces.Box(-1, 1, (1,)))
+    assert ReplayBufferSource(buffer).variables.state_names == ("obs[action][0]", "obs[action][1]", "pose[0]", "pose[1]")
+
+
+def test_the_whole_way_from_a_trained_model(tmp_path, capsys):
+    model = SAC("MlpPolicy", "Pendulum-v1", buffer_size=1_000, learning_starts=1_000, seed=0, device="cpu")
+    model.learn(600)
+    model.save_replay_buffer(tmp_path / "buffer.pkl")
+    main([str(tmp_path / "buffer.pkl"), "--plot", f"{tmp_path}/new/graph.png", "--json", f"{tmp_path}/new/graph.json"])
+    printed = capsys.readouterr().out
+    assert "buffer.pkl: 600 transitions\nstate variables: 3, action variables: 1\n" in printed
+    graph = CausalGraph.load(tmp_path / "new" / "graph.json")
+    assert (graph.method, graph.n_samples, graph.variables.action_names) == ("partial_r2", 600, ("action[0]",))
+    assert graph.action_to_state[2, 0] > 0.9
+    assert "action[0] -> obs[2]'" in printed
+    assert sorted(os.listdir(tmp_path / "new")) == ["graph.json", "graph.png"]
+    assert (tmp_path / "new" / "graph.png").read_bytes().startswith(b"\x89PNG")
+
+
+# Spaces -----------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "space, names",
+    [
+        (spaces.Box(-1, 1, (2, 2)), ["obs[0]", "obs[1]", "obs[2]", "obs[3]"]),
+        (spaces.Discrete(3, start=1), ["obs[0]", "obs[1]", "obs[2]"]),
+        (spaces.MultiDiscrete([2, 3]), [f"obs[{i}]" for i in range(5)]),
+        (
+            spaces.Dict({"b": spaces.Dict({"d": BOX, "c": spaces.Discrete(2)}), "a": spaces.MultiBinary(1)}),
+            ["a[0]", "b.c[0]", "b.c[1]", "b.d[0]", "b.d[1]"],
+        ),
+        (spaces.Tuple([spaces.Dict({"a": BOX}), spaces.Box(0, 1, ())]), ["obs[0.a][0]", "obs[0.a][1]", "obs[1][0]"]),
+    ],
+)
+def test_observations_are_flattened_as_gymnasium_does(space, names):
+    space.seed(0)
+    samples = [space.sample() for _ in range(6)]
+    flat = FlatSpace(space)
+    assert flat.names == tuple(names)
+    batch = concatenate(space, samples, create_empty_array(space, len(samples)))
+    np.testing.assert_array_equal(flat(batch), [spaces.flatten(space, sample) for sample in samples])
+
+
+# Minari -----------------------------------------------------------------------------------------------------------------
+
+
+class NestedEnv(gym.Env):
+    """Numbers that never repeat; episodes of six steps end, those of nine are cut."""
+
+    observation_space = spaces.Dict(
+        {
+            "goal": spaces.Box(-1e6, 1e6, (1,), np.float64),
+            "arm": spaces.Dict({"angle": spaces.Box(-1e6, 1e6, (2,), np.float64)}),
+        }
+    )
+    action_space = spaces.Box(-1, 1, (2,), np.float64)
+
+    def __init__(self):
+        self.episode, self.step_number = -1, 0
+
+    def observe(self):
+        number = 100.0 * self.episode + self.step_number
+        return {"goal": np.array([number]), "arm": {"angle": np.array([number + 0.25, number + 0.5])}}
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.episode, self.step_number = self.episode + 1, 0
+        return self.observe(), {}
+
+    def step(self, action):
+        self.step_number += 1
+        ends = self.step_number == (6 if self.episode % 2 else 9)
+        return self.observe(), float(action[0]), ends and self.episode % 2 == 1, ends and self.episode % 2 == 0, {}
+
+
+@pytest.fixture
+def minari(tmp_path, monkeypatch):
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "datasets"))
+    return pytest.importorskip("minari")
+
+
+def record(minari, dataset_id, env, n_episodes):
+    """Writes a dataset of random actions. Returns it and its rows."""
+    space, episodes, rows = env.observation_space, [], []
+    env.action_space.seed(0)
+    for episode in range(n_episodes):
+        observations, steps, done = [env.reset(seed=episode)[0]], [], False
+        while not done:
+            action = env.action_space.sample()
+            observation, reward, terminated, truncated, _ = env.step(action)
+            before, after = (spaces.flatten(space, which) for which in (observations[-1], observation))
+            rows.append(np.concatenate([before, action, after, [reward]]))
+            observations.append(observation)
+            steps.append((action, reward, terminated, truncated))
+            done = terminated or truncated
+        batch = concatenate(space, observations, create_empty_array(space, len(observations)))
+        actions, *rest = (np.array(values) for values in zip(*steps, strict=True))
+        episodes.append(minari.data_collector.EpisodeBuffer(episode, None, None, batch, actions, *rest, infos={}))
+    dataset = minari.create_dataset_from_buffers(
+        dataset_id, episodes, observation_space=space, action_space=env.action_space, data_format="hdf5"
+    )
+    return dataset, np.array(rows)
+
+
+def test_rows_of_a_minari_dataset(minari):
+    _, expected = record(minari, "tests/nested-v0", NestedEnv(), 4)
+    source = open_source("tests/nested-v0")
+    assert source.variables.state_names == ("arm.angle[0]", "arm.angle[1]", "goal[0]")
+    assert source.n_rows == len(expected) == 30
+    np.testing.assert_array_equal(rows_of(source), expected)
+
+
+def test_the_whole_way_from_a_minari_dataset(minari, capsys):
+    dataset, rows = record(minari, "pendulum/random-v0", gym.make("Pendulum-v1", max_episode_steps=50), 4)
+    main(["pendulum/random-v0", "--method", "notears", "--max-rows", "150"])
+    printed = capsys.readouterr().out
+    assert "pendulum/random-v0: 150 of 200 transitions" in printed
+    assert "notears: " in printed
+    np.testing.assert_array_equal(rows_of(MinariSource(dataset)), rows)
+    chosen = np.linspace(0, 199, 80).astype(int)
+    np.testing.assert_array_equal(rows_of(MinariSource(dataset, max_rows=80)), rows[chosen])
+
+
+def test_minari_dataset_that_is_not_there(minari, capsys):
+    assert "no Minari dataset 'no/such-v0' on this machine" in error_of(capsys, "no/such-v0")
+
+
+def test_minari_is_not_installed(monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "minari", None)
+    assert 'pip install "sb3_causalgdp[offline]"' in error_of(capsys, "D4RL/door/human-v2")
+
+
+# The command ------------------------------------------------------------------------------------------------------------
+
+
+def test_summary(arrays, capsys):
+    main([str(arrays)])
+    printed = capsys.readouterr()
+    assert printed.err == ""
+    for part in (
+        f"{arrays}: 600 transitions\n",
+        "partial_r2: 4 of 9 possible edges have a mask above 0.5",
+        "   obs[0] -> obs[0]'\n",
+        "   obs[1] -> obs[1]'\n",
+        "action[0] -> obs[0]'\n",
+        "  obs[0]' -> reward\n",
+        "R^2: obs[0]' 0.99",
+        "variance inflation",
+        "s discovery)",
+    ):
+        assert part in printed.out
+    assert "constant" not in printed.out
+
+
+def test_summary_of_variables_that_cannot_be_told_apart(tmp_path, capsys):
+    rows = make_rows(600)
+    for key in ("observations", "next_observations"):
+        states = rows[key]
+        rows[key] = np.column_stack([states, 2.0 * states[:, 0], np.ones(600), np.random.default_rng(1).normal(size=(600, 6))])
+    rows["actions"] = rows["observations"][:, :1] + 1e-3 * rows["actions"]
+    np.savez(tmp_path / "rows.npz", **rows)
+    main([str(tmp_path / "rows.npz")])
+    printed = capsys.readouterr()
+    assert "obs[0] = obs[2]" in printed.out
+    assert "constant, without edges: obs[3], obs[3]'" in printed.out
+    assert "(the lowest 8 of 11)" in printed.out
+    assert printed.err.startswith("warning: The states almost determine the actions")
+    assert printed.err.count("\n") == 1
+
+
+def test_quiet_and_without_tqdm(arrays, tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "tqdm", None)
+    main([str(arrays), "--quiet", "--json", str(tmp_path / "graph.json")])
+    assert capsys.readouterr() == ("", "")
+    assert CausalGraph.load(tmp_path / "graph.json").n_samples == 600
+
+
+def test_python_m(arrays):
+    env = {**os.environ, "PYTHONPATH": str(Path(sb3_causalgdp.__file__).parents[1])}
+    command = [sys.executable, "-m", "sb3_causalgdp.causal", str(arrays), "--method-kwargs", "threshold=0.05"]
+    done = subprocess.run(command, env=env, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    assert "partial_r2: 4 of 9 possible edges" in done.stdout
+
+
+@pytest.mark.parametrize("options", [["--window", "400"], ["--half-life", "50"], []])
+def test_window_and_half_life_forget(tmp_path, options):
+    old, new = make_rows(600), make_rows(800, seed=1)
+    new["next_observations"][:, 0] *= -1.0  # the effects turn round
+    np.savez(tmp_path / "rows.npz", **{key: np.concatenate([old[key], new[key]]) for key in old})
+    main([str(tmp_path / "rows.npz"), "--quiet", "--method", "notears", "--json", str(tmp_path / "graph.json"), *options])
+    effect = CausalGraph.load(tmp_path / "graph.json").effect_state_to_state[0, 0]
+    assert effect < -0.5 if options else abs(effect) < 0.3
+
+
+def test_rows_are_read_again_when_their_scale_has_moved(tmp_path):
+    rows = make_rows(900)
+    rows["observations"][:300] *= 0.01
+    rows["next_observations"][:300] *= 0.01
+    source = ArraySource(**rows)
+    method = make_discovery("partial_r2")
+    statistics = make_statistics(method, source.variables)
+    feed(statistics, source, batch_rows=100)
+    assert not statistics.wants_history
+    assert method(statistics, source.variables).n_samples == 900
+
+
+def test_kwargs():
+    items = ["threshold=0.1", "products=False", "max_memory=1e8", "on_degenerate=raise", '{"spread": 1, "products": null}']
+    expected = {"threshold": 0.1, "products": None, "max_memory": 1e8, "on_degenerate": "raise", "spread": 1}
+    assert parse_kwargs(items) == expected
+    assert parse_kwargs(["products=False"]) == {"products": False}
+
+
+# Mistakes ---------------------------------------------------------------------------------------------------------------
+
+
+def test_mistakes_in_the_arguments(arrays, capsys):
+    for options, message in (
+        (["--method", "magic"], "unknown discovery method 'magic', known are ['notears', 'partial_r2'"),
+        (["--method-kwargs", "sparsity=1"], "unknown arguments ['sparsity'] for discovery method 'partial_r2'"),
+        (["--method-kwargs", "threshold=2"], "threshold must be in (0, 1), got 2"),
+        (["--method-kwargs", "threshold=low"], "--method-kwargs: "),
+        (["--method-kwargs", "max_memory=much"], "--method-kwargs: "),
+        (["--method-kwargs", "threshold"], "--method-kwargs must be key=value or a JSON object, got 'threshold'"),
+        (["--method-kwargs", "{threshold}"], "'{threshold}' is no JSON object"),
+        (["--window", "0"], "--window: must be an integer of at least 1, got '0'"),
+        (["--window", "3"], "window must be None or at least 8 rows"),
+        (["--max-rows", "many"], "--max-rows: must be an integer"),
+        (["--max-rows", "5"], "partial_r2 needs at least 10 rows"),
+        (["--plot", "graph.txt"], "path must end in one of"),
+        (["--json", str(arrays.parent)], "directory"),
+    ):
+        assert message in error_of(capsys, arrays, *(["--quiet", *options]))
+
+
+def test_mistakes_in_the_source(tmp_path, capsys):
+    (tmp_path / "broken.pkl").write_bytes(b"no pickle")
+    (tmp_path / "broken.npz").write_bytes(b"no zip")
+    (tmp_path / "table.csv").write_text("1,2,3")
+    (tmp_path / "list.pkl").write_bytes(pickle.dumps([1, 2, 3]))
+    save_to_pkl(tmp_path / "rollout.pkl", RolloutBuffer(4, BOX, BOX))
+    save_to_pkl(tmp_path / "empty.pkl", ReplayBuffer(4, BOX, BOX))
+    np.savez(tmp_path / "half.npz", observations=np.zeros((3, 2)), actions=np.zeros((3, 1)))
+    for name, message in (
+        ("missing.pkl", "no file"),
+        ("missing", "no file"),
+        ("broken.pkl", "broken.pkl cannot be read as a replay buffer: UnpicklingError"),
+        ("broken.npz", "broken.npz cannot be read as arrays"),
+        ("table.csv", "table.csv is neither a saved replay buffer (.pkl) nor arrays (.npz)"),
+        ("list.pkl", "list.pkl holds no replay buffer but a list"),
+        ("rollout.pkl", "rollout.pkl holds no replay buffer but a RolloutBuffer"),
+        ("empty.pkl", "empty.pkl holds no transitions"),
+        ("half.npz", "half.npz lacks the arrays ['next_observations', 'rewards']"),
+    ):
+        assert message in error_of(capsys, tmp_path / name)
+
+
+@pytest.mark.parametrize(
+    "observation_space, action_space, message",
+    [
+        (BOX, spaces.Discrete(3), r"continuous actions are needed \(a Box\), got Discrete\(3\)"),
+        (spaces.Box(0, 255, (32, 32, 3), np.uint8), BOX, r"'obs' are images of shape \(32, 32, 3\)"),
+        (spaces.Dict({"v": BOX, "camera": spaces.Box(0, 255, (32, 32, 1), np.uint8)}), BOX, r"'camera' are images"),
+    ],
+)
+def test_spaces_that_discovery_cannot_use(observation_space, action_space, message):
+    kind = DictReplayBuffer if isinstance(observation_space, spaces.Dict) else ReplayBuffer
+    with pytest.raises(SourceError, match=message):
+        ReplayBufferSource(kind(4, observation_space, action_space))
+
+
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        ({"actions": np.zeros((600, 1), dtype=int)}, "continuous actions are needed, got an array of int64"),
+        ({"observations": np.zeros((600, 8, 8), dtype=np.uint8)}, "'observations' are images"),
+        ({"rewards": np.zeros(599)}, "all arrays must have a row for each transition"),
+    ],
+)
+def test_arrays_that_discovery_cannot_use(change, message):
+    with pytest.raises(SourceError, match=message):
+        ArraySource(**{**make_rows(600), **change})
+
+
+def test_rows_that_are_not_finite(tmp_path, capsys):
+    rows = make_rows(6_000)
+    rows["next_observations"][5_000, 1] = np.nan
+    np.savez(tmp_path / "rows.npz", **rows)
+    assert error_of(capsys, tmp_path / "rows.npz").endswith("transition 5000 is NaN or infinite in obs[1]'")
