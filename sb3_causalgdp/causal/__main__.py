@@ -222,14 +222,15 @@ def summary_of(graph: CausalGraph, source: TransitionSource) -> str:
     variables = source.variables
     part = "" if source.n_rows == source.n_stored else f" of {source.n_stored:,}"
     lines = [
-        f"{source.name}: {source.n_rows:,}{part} transitions, {variables.n_states} states, {variables.n_actions} actions",
+        f"{source.name}: {source.n_rows:,}{part} transitions",
+        f"state variables: {variables.n_states}, action variables: {variables.n_actions}",
         *_edge_lines(graph),
     ]
     if graph.r_squared is not None:
         effects = (*variables.next_state_names, "reward")
-        lines.append(f"R^2: {_extreme_values(effects, graph.r_squared, 'lowest')}")
+        lines.append(f"R^2: {_extreme_values(effects, graph.r_squared, 'lowest', '.3f')}")
     if graph.action_vif is not None:
-        shown = _extreme_values(variables.action_names, graph.action_vif, "highest")
+        shown = _extreme_values(variables.action_names, graph.action_vif, "highest", ".3g")
         lines.append(f"variance inflation (over {CONFOUNDED_VIF:g}: the states almost determine the action): {shown}")
     if graph.constant_variables:
         lines.append(f"constant, without edges: {_shortened(graph.constant_variables)}")
@@ -241,7 +242,7 @@ def summary_of(graph: CausalGraph, source: TransitionSource) -> str:
 
 def _edge_lines(graph: CausalGraph) -> list[str]:
     edges = [edge for edge in graph.edges() if edge.mask > THRESHOLD]
-    edges.sort(key=lambda edge: (-edge.mask, -abs(edge.strength)))
+    edges.sort(key=lambda edge: (-round(edge.mask, 2), -abs(edge.strength)))
     shown = edges[:SHOWN_EDGES]
     lines = [f"{graph.method}: {len(edges)} of {graph.masks.size} possible edges have a mask above {THRESHOLD:g}"]
     width = max((len(edge.cause) for edge in shown), default=0)
@@ -255,14 +256,14 @@ def _edge_lines(graph: CausalGraph) -> list[str]:
     return lines
 
 
-def _extreme_values(names: Sequence[str], values: np.ndarray, which: str) -> str:
+def _extreme_values(names: Sequence[str], values: np.ndarray, which: str, digits: str) -> str:
     """All values, or the few that say most."""
     order = np.argsort(values if which == "lowest" else -values, kind="stable")[:SHOWN_VALUES]
     if len(values) <= SHOWN_VALUES:
         order, remark = np.arange(len(values)), ""
     else:
         remark = f" (the {which} {SHOWN_VALUES} of {len(values)})"
-    return ", ".join(f"{names[i]} {values[i]:.3g}" for i in order) + remark
+    return ", ".join(f"{names[i]} {values[i]:{digits}}" for i in order) + remark
 
 
 def _shortened(names: Sequence[str]) -> str:

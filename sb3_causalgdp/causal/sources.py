@@ -329,7 +329,7 @@ def _open_arrays(path: Path, max_rows: int | None) -> TransitionSource:
     try:
         with np.load(path, allow_pickle=False) as file:
             arrays = {name: file[name] for name in ARRAYS if name in file}
-    except (BadZipFile, EOFError, OSError, ValueError) as error:
+    except (BadZipFile, EOFError, OSError, TypeError, ValueError) as error:
         raise SourceError(f"{path} cannot be read as arrays: {error}") from error
     missing = [name for name in ARRAYS if name not in arrays]
     if missing:
