@@ -1,5 +1,6 @@
 """The causal world model's schedule: every N environment steps, statistics, discovery, masks."""
 
+import math
 import time
 import warnings
 from collections.abc import Iterator
@@ -17,8 +18,9 @@ from sb3_causalgdp.diagnostics import guidance_divergence, step_size_bound
 
 class CausalWorldModelCallback(BaseCallback):
     """
-    Every ``refresh_freq`` environment steps: feed the new transitions to the discovery's statistics, rediscover the causal graph and write
-    its masks into the world model.
+    Every ``refresh_freq`` environment steps: feed the new transitions to the discovery's statistics, rediscover the causal
+    graph and write its masks into the world model. In ``pretrain()``, before the first gradient step and every
+    ``refresh_freq`` of them.
 
     :class:`~sb3_causalgdp.CausalGDP` adds one by itself; passing an own instance to ``learn()`` replaces it. The schedule and
     the moments live on the model, so that they go on after ``save`` and ``load`` and with ``reset_num_timesteps=False``.
@@ -34,6 +36,7 @@ class CausalWorldModelCallback(BaseCallback):
     FEED_ROWS = 10_000
     FEED_IMAGE_ROWS = 256
     HISTORY_ROWS = 20_000
+    OFFLINE_HISTORY_ROWS = 100_000
 
     def __init__(
         self,
@@ -56,11 +59,8 @@ class CausalWorldModelCallback(BaseCallback):
         self._counted_steps = self.model.num_timesteps
 
     def _on_training_start(self) -> None:
-        buffer = self.model.replay_buffer
-        assert buffer is not None
-        if not buffer.full and self.model._fed_position > buffer.pos:
-            # A loaded model starts with an empty buffer
-            self.model._fed_position = 0
+        if self.model.is_pretraining:
+            self.refresh()
 
     def _on_step(self) -> bool:
         # By the model's counter: inside an event callback this is not called at every step
@@ -87,7 +87,7 @@ class CausalWorldModelCallback(BaseCallback):
             return
         before = model.causal_graph()
         graph = model.discovery(statistics, variables, model._causal_graph)
-        graph = replace(graph, num_timesteps=int(model.num_timesteps))
+        graph = replace(graph, num_timesteps=int(model.n_environment_steps))
         model.set_causal_graph(graph)
         self.logger.record("causal/n_edges", graph.n_edges)
         self.logger.record("causal/change", graph.change_since(before))
@@ -105,31 +105,43 @@ class CausalWorldModelCallback(BaseCallback):
             )
 
     def _feed_statistics(self) -> None:
-        """Hand the statistics the rows that were written to the replay buffer since the last time."""
-        buffer = self.model.replay_buffer
-        assert buffer is not None
-        n_rows = (buffer.pos - self.model._fed_position) % buffer.buffer_size
-        oldest = buffer.buffer_size if buffer.full else buffer.pos
-        if buffer.full:
-            # The memory efficient buffer has overwritten its oldest observation
-            oldest -= int(buffer.optimize_memory_usage)
-            if self.model._steps_since_refresh // buffer.n_envs >= buffer.buffer_size:
-                n_rows = oldest  # the writing position has gone round
-        statistics = self.model.causal_statistics
-        for rows in self._newest_rows(buffer, n_rows):
-            statistics.update(rows)
-        self.model._fed_position = buffer.pos
+        """Hand the statistics the rows that they have not seen: preloaded ones first, then those of the replay buffer."""
+        model, statistics = self.model, self.model.causal_statistics
+        if statistics.n_samples == 0:
+            # Not by the buffer's position: one that is just full is at its start again
+            model._fed_offline_position, model._fed_position = 0, -math.inf
+        offline, online = model.offline_buffer, model.replay_buffer
+        if offline is not None:
+            for rows in self._rows_at(offline, np.arange(model._fed_offline_position, offline.size())):
+                statistics.update(rows)
+            model._fed_offline_position, model._fed_marks = offline.size(), list(model._offline_marks)
+        if online is not offline:
+            for rows in self._newest_rows(online, model._stored_position - model._fed_position):
+                statistics.update(rows)
+        model._fed_position = model._stored_position
         if getattr(statistics, "wants_history", False):
             statistics.restart()
-            for rows in self._newest_rows(buffer, min(oldest, max(1, self.HISTORY_ROWS // buffer.n_envs))):
+            for rows in self._history(offline, online):
                 statistics.refill(rows)
 
-    def _newest_rows(self, buffer: ReplayBuffer, n_positions: int) -> Iterator[np.ndarray]:
-        """The transitions of the newest positions, oldest first, in parts that fit into memory."""
-        positions = np.arange(buffer.pos - n_positions, buffer.pos) % buffer.buffer_size
+    def _history(self, offline: ReplayBuffer | None, online: ReplayBuffer) -> Iterator[np.ndarray]:
+        if offline is not None:
+            n_rows = min(offline.size(), max(1, self.OFFLINE_HISTORY_ROWS // offline.n_envs))
+            yield from self._rows_at(offline, np.linspace(0, offline.size() - 1, n_rows).astype(np.int64))
+        if online is not offline:
+            yield from self._newest_rows(online, max(1, self.HISTORY_ROWS // online.n_envs))
+
+    def _newest_rows(self, buffer: ReplayBuffer, n_positions: float) -> Iterator[np.ndarray]:
+        """The transitions of at most so many newest positions, oldest first, in parts that fit into memory."""
+        # The full memory efficient buffer has overwritten its oldest observation
+        n_held = buffer.size() - int(buffer.full and buffer.optimize_memory_usage)
+        n_positions = int(min(n_positions, n_held))
+        yield from self._rows_at(buffer, np.arange(buffer.pos - n_positions, buffer.pos) % buffer.buffer_size)
+
+    def _rows_at(self, buffer: ReplayBuffer, positions: np.ndarray) -> Iterator[np.ndarray]:
         chunk = self.FEED_IMAGE_ROWS if self.model.policy.has_image_state else self.FEED_ROWS
         positions_per_chunk = max(1, chunk // buffer.n_envs)
-        for first in range(0, n_positions, positions_per_chunk):
+        for first in range(0, len(positions), positions_per_chunk):
             rows = self._read(buffer, positions[first : first + positions_per_chunk])
             if len(rows) > 0:
                 yield rows
@@ -178,11 +190,11 @@ class CausalWorldModelCallback(BaseCallback):
         model = self.model
         if self.diagnostics_batch_size == 0 or not model.policy.is_guided:
             return
-        assert model.replay_buffer is not None
-        if model.replay_buffer.size() == 0:
+        buffer = model.replay_buffer if model.replay_buffer.size() > 0 else model.offline_buffer
+        if buffer is None:
             # A loaded model starts with an empty buffer
             return
-        observations = self._draw_observations(model.replay_buffer)
+        observations = self._draw_observations(buffer)
         model.policy.set_training_mode(False)
         self.logger.record("guidance/kl", guidance_divergence(model.policy, observations))
         bound = step_size_bound(model.policy, observations)

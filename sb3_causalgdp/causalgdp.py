@@ -13,9 +13,8 @@ import numpy.typing as npt
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
-from stable_baselines3.common.callbacks import BaseCallback, CallbackList, ConvertCallback
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.noise import ActionNoise
-from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy, ContinuousCritic
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.utils import FloatSchedule, get_parameters_by_name, polyak_update, update_learning_rate
@@ -35,13 +34,15 @@ from sb3_causalgdp.causal import (
 from sb3_causalgdp.causal.interventions import ActionRule
 from sb3_causalgdp.causal.world_model import MaskedWorldModel
 from sb3_causalgdp.losses import critic_loss, denoising_loss, q_loss, td_target, world_model_loss
+from sb3_causalgdp.offline.algorithm import OfflineToOnlineAlgorithm, callback_list
+from sb3_causalgdp.offline.replay import concatenate_samples
 from sb3_causalgdp.policies import CausalGDPPolicy, CnnPolicy, DiffusionActor, MlpPolicy, MultiInputPolicy, q_values
 from sb3_causalgdp.structural import StatePolicy, actions_of, make_structural_model, states_of
 
 SelfCausalGDP = TypeVar("SelfCausalGDP", bound="CausalGDP")
 
 
-class CausalGDP(OffPolicyAlgorithm):
+class CausalGDP(OfflineToOnlineAlgorithm):
     """
     Causality-Guided Diffusion Policy (CausalGDP).
 
@@ -99,6 +100,15 @@ class CausalGDP(OffPolicyAlgorithm):
     :param causal_half_life: Half-life, in transitions, of the statistics from which the graph is found; None forgets nothing
     :param causal_window: Number of newest transitions from which the graph is found (the paper's temporal window); None takes
         all
+    :param offline_dataset: Id of a Minari dataset, or path of a saved replay buffer or of arrays, that is preloaded when
+        training starts and no transitions are there; so a loaded model, whose buffer is empty, loads it again
+    :param pretrain_steps: Gradient steps of :meth:`pretrain` before the first step of ``learn()``; those that were made
+        before count, so that an interrupted run does the rest
+    :param offline_fraction: Share of a batch that comes from preloaded transitions once ``learn()`` has collected others
+        (symmetric sampling of RLPD, https://arxiv.org/abs/2302.02948); it can be a function of the current progress remaining
+        (from 1 to 0)
+    :param reward_transform: What is done to the rewards of preloaded transitions, and then to the environment's too: a key of
+        :data:`~sb3_causalgdp.offline.rewards.REWARD_TRANSFORMS`; only a model with preloaded transitions transforms them
     :param stats_window_size: Window size for the rollout logging, specifying the number of episodes to average
         the reported success rate, mean episode length, and mean reward over
     :param tensorboard_log: The log location for tensorboard (if None, no logging)
@@ -170,6 +180,10 @@ class CausalGDP(OffPolicyAlgorithm):
         causal_refresh_freq: int = 1_000,
         causal_half_life: float | None = None,
         causal_window: int | None = None,
+        offline_dataset: str | None = None,
+        pretrain_steps: int = 0,
+        offline_fraction: float | Schedule = 0.5,
+        reward_transform: str = "none",
         stats_window_size: int = 100,
         tensorboard_log: str | None = None,
         policy_kwargs: dict[str, Any] | None = None,
@@ -203,6 +217,10 @@ class CausalGDP(OffPolicyAlgorithm):
             sde_support=False,
             supported_action_spaces=(spaces.Box,),
             support_multi_env=True,
+            offline_dataset=offline_dataset,
+            pretrain_steps=pretrain_steps,
+            offline_fraction=offline_fraction,
+            reward_transform=reward_transform,
         )
         self.critic_learning_rate = critic_learning_rate
         self.world_model_learning_rate = world_model_learning_rate
@@ -233,7 +251,12 @@ class CausalGDP(OffPolicyAlgorithm):
         self._causal_graph: CausalGraph | None = None
         self.causal_graph_history: list[CausalGraph] = []
         self._steps_since_refresh = 0
+        # Positions of the replay buffer that were ever written, and how many of them the statistics have seen
+        self._stored_position = 0
         self._fed_position = 0
+        # The same of the preloaded transitions, and which these were
+        self._fed_offline_position = 0
+        self._fed_marks: list[str] = []
 
         if _init_setup_model:
             self._setup_model()
@@ -268,7 +291,8 @@ class CausalGDP(OffPolicyAlgorithm):
             # Another method, which load() may have brought, gathers anew from the replay buffer
             self.causal_statistics = make_statistics(self.discovery, self.transition_variables, *forgetting)
             self._statistics_made_by = made_by
-            self._fed_position = 0
+            self._fed_position = self._fed_offline_position = 0
+            self._fed_marks = []
 
     def _check_arguments(self) -> None:
         for name in ("eta", "denoising_weight"):
@@ -313,12 +337,7 @@ class CausalGDP(OffPolicyAlgorithm):
         update_learning_rate(_optimizer_of(self.world_model), self.world_model_lr_schedule(progress))
 
     def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
-        if callback is None:
-            callbacks: list[BaseCallback] = []
-        elif isinstance(callback, list):
-            callbacks = callback
-        else:
-            callbacks = [callback if isinstance(callback, BaseCallback) else ConvertCallback(callback)]
+        callbacks = callback_list(callback)
         n_own = sum(isinstance(one, CausalWorldModelCallback) for top in callbacks for one in _flatten(top))
         if n_own > 1:
             raise ValueError(f"At most one CausalWorldModelCallback can be passed, got {n_own}")
@@ -336,7 +355,7 @@ class CausalGDP(OffPolicyAlgorithm):
     def set_causal_graph(self, graph: CausalGraph) -> None:
         """
         Write a causal graph into the masks of the world model and let it steer the sampling. The graphs of up to 32 moments of
-        the training are in ``causal_graph_history``, which is saved on request: ``save(path, include=["causal_graph_history"])``.
+        the training are in ``causal_graph_history``, saved on request: ``save(path, include=["causal_graph_history"])``.
 
         :param graph: The graph, on this model's variables
         :raises ValueError: If the graph is about other variables
@@ -437,10 +456,10 @@ class CausalGDP(OffPolicyAlgorithm):
         losses: dict[str, list[float]] = {}
         for _ in range(gradient_steps):
             self._n_updates += 1
-            replay_data = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)  # type: ignore[union-attr]
+            replay_data = self._sample(batch_size)
             one_step = replay_data
             if isinstance(self.replay_buffer, NStepReplayBuffer):
-                one_step = self._sample_one_step(self.replay_buffer, batch_size)
+                one_step = self._sample(batch_size, one_step=True)
             next_actions, step_losses = self._update_critics(replay_data)
             step_losses.update(self._update_world_model(one_step))
             if one_step is not replay_data:
@@ -455,7 +474,18 @@ class CausalGDP(OffPolicyAlgorithm):
         for name, values in losses.items():
             self.logger.record(f"train/{name}", np.mean(values))
 
-    def _sample_one_step(self, replay_buffer: NStepReplayBuffer, batch_size: int):
+    def _sample(self, batch_size: int, one_step: bool = False) -> Any:
+        """A batch from the replay buffer, from the preloaded transitions, or from both."""
+        assert self.replay_buffer is not None
+        n_offline = self._n_offline(batch_size)
+        parts = ((self.replay_buffer, batch_size - n_offline), (self.offline_buffer, n_offline))
+        draw = self._draw_one_step if one_step else self._draw
+        return concatenate_samples([draw(buffer, count) for buffer, count in parts if buffer is not None and count > 0])
+
+    def _draw(self, replay_buffer: ReplayBuffer, batch_size: int) -> Any:
+        return replay_buffer.sample(batch_size, env=self._vec_normalize_env)
+
+    def _draw_one_step(self, replay_buffer: ReplayBuffer, batch_size: int) -> Any:
         # The n-step buffer gives n-step rewards and observations, which are wrong for a one-step world model
         indices = np.random.randint(0, replay_buffer.size(), size=batch_size)
         return ReplayBuffer._get_samples(replay_buffer, indices, env=self._vec_normalize_env)
@@ -558,6 +588,21 @@ class CausalGDP(OffPolicyAlgorithm):
         self._check_finite(self._last_obs, "observation")
         return result
 
+    def preload(self: SelfCausalGDP, source: Any, *args, **kwargs) -> SelfCausalGDP:
+        first = 0 if self.offline_buffer is None else self.offline_buffer.size()
+        super().preload(source, *args, **kwargs)
+        assert self.offline_buffer is not None
+        if self._offline_marks[-1] in self._fed_marks and self._fed_offline_position == first:
+            # A loaded model, whose statistics know these rows
+            self._fed_offline_position = self.offline_buffer.size()
+        return self
+
+    def load_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
+        super().load_replay_buffer(path, truncate_last_traj)
+        self._fed_offline_position = 0
+        if self.offline_buffer is not None and all(mark in self._fed_marks for mark in self._offline_marks):
+            self._fed_offline_position = self.offline_buffer.size()
+
     def _store_transition(self, replay_buffer, buffer_action, new_obs, reward, dones, infos) -> None:
         # Before anything is written: one NaN would spread from the buffer to every network and to the graph
         self._check_finite(new_obs, "observation")
@@ -566,6 +611,7 @@ class CausalGDP(OffPolicyAlgorithm):
             if done and info.get("terminal_observation") is not None:
                 self._check_finite(info["terminal_observation"], "terminal observation")
         super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
+        self._stored_position += 1
 
     def _check_finite(self, values, name: str) -> None:
         if isinstance(values, dict):
@@ -613,6 +659,7 @@ class CausalGDP(OffPolicyAlgorithm):
             "critic_target",
             "world_model",
             "discovery",
+            "_fed_offline_position",
             "causal_graph_history",
             "actor_batch_norm_stats",
             "critic_batch_norm_stats",

@@ -8,7 +8,7 @@ import sb3_causalgdp
 PACKAGE = Path(sb3_causalgdp.__file__).parent
 # From the roof to the ground: imports go down; the parts of one line do not import each other
 LAYERS = [
-    {"zoo"},
+    {"zoo", "datasets"},
     {"__init__"},
     {"causalgdp"},
     {"callbacks"},

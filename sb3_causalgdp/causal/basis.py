@@ -10,13 +10,15 @@ from sb3_causalgdp.causal.variables import TransitionVariables
 
 N_FUNCTIONS = 4  # each variable as itself, its square, sine and tanh
 FEATURE_BOUND = 5.0  # standard deviations: outliers must not rule the squares and products
-FEED_ROWS = 4096
+FEED_ROWS = 512  # so that the features of a batch need little memory beside the moments
 
 
 @dataclass
 class BasisExpansion:
     """
     Features of p standardised inputs z: ``[z, z^2, sin z, tanh z]`` and, if asked for, the products ``z_i z_j``, i < j.
+
+    All but the first are functions of z limited to [-5, 5].
 
     :param location: Means of the inputs, shape (p,)
     :param scale: Standard deviations of the inputs, 1 for inputs that do not move, shape (p,)
@@ -29,9 +31,9 @@ class BasisExpansion:
 
     def __post_init__(self) -> None:
         n_inputs = len(self.location)
-        first, second = np.triu_indices(n_inputs, k=1) if self.products else np.zeros((2, 0), dtype=int)
-        self._first, self._second = first, second
-        self.n_features = N_FUNCTIONS * n_inputs + len(first)
+        first, second = np.triu_indices(n_inputs, k=1)
+        self._first, self._second = (first, second) if self.products else (first[:0], second[:0])
+        self.n_features = N_FUNCTIONS * n_inputs + len(self._first)
 
     def standardise(self, inputs: np.ndarray) -> np.ndarray:
         """
@@ -45,9 +47,25 @@ class BasisExpansion:
         :param standardised: z, shape (N, p)
         :return: shape (N, n_features)
         """
-        bounded = np.clip(standardised, -FEATURE_BOUND, FEATURE_BOUND)
+        bounded = _bounded(standardised)
         products = bounded[:, self._first] * bounded[:, self._second]
-        return np.concatenate([standardised, bounded**2, np.sin(bounded), np.tanh(bounded), products], axis=1)
+        return np.concatenate([_functions(standardised), products], axis=1)
+
+    def difference(self, standardised: np.ndarray, variable: int, half_step: float) -> np.ndarray:
+        """
+        How much larger the features are when a variable is half a step above its value instead of half a step below.
+
+        :param standardised: z, shape (N, p)
+        :param variable: Index of an input
+        :param half_step: In units of z
+        :return: of the features in ``features_of(variable)``, the others do not change; shape (N, len(features_of(variable)))
+        """
+        above, below = standardised[:, [variable]] + half_step, standardised[:, [variable]] - half_step
+        own = _functions(above) - _functions(below)
+        if not self.products:
+            return own
+        others = np.delete(_bounded(standardised), variable, axis=1)
+        return np.concatenate([own, (_bounded(above) - _bounded(below)) * others], axis=1)
 
     def features_of(self, variable: int) -> np.ndarray:
         """
@@ -63,17 +81,25 @@ class BasisExpansion:
         """
         :param inputs: Indices of the inputs that are kept
         :param functions: How many of the functions are kept, from 1 (linear) to 4
-        :param products: Whether the products are kept
+        :param products: Whether the products are kept, if there are any
         :return: indices of the features of these inputs alone
         """
         n_inputs = len(self.location)
         own = (np.asarray(inputs) + n_inputs * np.arange(functions)[:, None]).ravel()
-        if not (products and self.products):
+        if not products:
             return own
-        kept = np.zeros(n_inputs, dtype=bool)
-        kept[inputs] = True
-        both = np.flatnonzero(kept[self._first] & kept[self._second])
+        both = np.flatnonzero(np.isin(self._first, inputs) & np.isin(self._second, inputs))
         return np.concatenate([own, N_FUNCTIONS * n_inputs + both])
+
+
+def _bounded(standardised: np.ndarray) -> np.ndarray:
+    return np.clip(standardised, -FEATURE_BOUND, FEATURE_BOUND)
+
+
+def _functions(standardised: np.ndarray) -> np.ndarray:
+    """The features that are functions of one variable, shape (N, 4 p)."""
+    bounded = _bounded(standardised)
+    return np.concatenate([standardised, bounded**2, np.sin(bounded), np.tanh(bounded)], axis=1)
 
 
 class BasisMoments:
@@ -82,7 +108,7 @@ class BasisMoments:
 
     The first rows fix the standardisation of the inputs. When their location or scale has moved by more than a factor of 3, as
     it does while a policy learns, the features start anew on the new scale; ``wants_history`` says that older rows may then be
-    fed again through :meth:`refill`.
+    fed again: through :meth:`restart`, and :meth:`refill` with each batch.
 
     :param variables: Names and order of the variables
     :param half_life: Number of new rows after which an old row weighs half; None weighs all alike
@@ -113,9 +139,10 @@ class BasisMoments:
         block_bytes = 8 * ((n_features + n_states) ** 2 + (n_features + 1) ** 2)
         n_blocks = min(self.MAX_BLOCKS, 2 * int(max_memory // (2 * block_bytes)))
         if n_blocks < 2:
+            advice = "use products=False, or more memory" if self.products else "give it more memory"
             raise ValueError(
                 f"{n_features} features of {n_inputs} states and actions need {2 * block_bytes / 1e6:.0f} MB, "
-                f"and max_memory is {max_memory / 1e6:.0f} MB: use products=False, or more memory"
+                f"and max_memory is {max_memory / 1e6:.0f} MB: {advice}"
             )
         self.dynamics = StreamingMoments(n_features + n_states, half_life, window=window, n_blocks=n_blocks)
         self.reward = StreamingMoments(n_features + 1, half_life, window=window, n_blocks=n_blocks)
@@ -124,6 +151,7 @@ class BasisMoments:
         self.inputs_of_reward = np.concatenate([columns[variables.next_state], columns[variables.action]])
         self.expansions: tuple[BasisExpansion, BasisExpansion] | None = None
         self.recent = np.empty((0, variables.n_variables))
+        """The newest rows, at most 256."""
         self.wants_history = False
         self._waiting: list[np.ndarray] = []
 
@@ -139,27 +167,29 @@ class BasisMoments:
         :param rows: shape (N, 2 n + d + 1), N may be 0; never changed
         :raises ValueError: on a wrong shape, or on NaN, infinite or absurdly large values, naming the variables
         """
-        rows = np.asarray(rows, dtype=np.float64)
-        self.raw.update(rows)
+        rows = self.raw.checked(rows)
         if len(rows) == 0:
             return
-        self.recent = np.concatenate([self.recent, rows])[-self.RECENT_ROWS :]
+        for part in _in_parts(rows):
+            self.raw.update(part)
+        self.recent = np.concatenate([self.recent, rows[-self.RECENT_ROWS :]])[-self.RECENT_ROWS :].copy()
+        if self.expansions is None and self.raw.n_samples < self.FIRST_ROWS:
+            self._waiting.append(rows.copy())
+            return
         if self.expansions is None:
-            self._waiting.append(rows)
-            if self.raw.n_samples >= self.FIRST_ROWS:
-                self.start()
-        else:
-            if self._has_moved():
-                self.restart()
-                self.wants_history = True
-            self._feed(rows)
+            self.start()
+        elif self._has_moved():
+            self.restart()
+            self.wants_history = True
+        self._feed(rows)
 
     def start(self) -> None:
         """Fix the standardisation now, with the rows that there are."""
-        if self.expansions is not None or not self._waiting:
+        if self.expansions is not None or self.raw.n_samples == 0:
             return
         self._set_expansions()
-        self._feed(np.concatenate(self._waiting))
+        for rows in self._waiting:
+            self._feed(rows)
         self._waiting = []
 
     def restart(self) -> None:
@@ -167,15 +197,18 @@ class BasisMoments:
         self._set_expansions()
         self.dynamics.clear()
         self.reward.clear()
+        self._waiting = []
 
     def refill(self, rows: npt.ArrayLike) -> None:
         """
-        Feed rows to the features alone that had been fed before the features started anew.
+        Feed rows to the features alone that had been fed before the features started anew; oldest first.
 
         :param rows: shape (N, 2 n + d + 1)
+        :raises ValueError: where ``update`` would raise
         """
+        rows = self.raw.checked(rows)
         self.wants_history = False
-        self._feed(np.asarray(rows, dtype=np.float64))
+        self._feed(rows)
 
     def _set_expansions(self) -> None:
         mean, scale = self.raw.mean, np.where(self.raw.constant, 1.0, self.raw.standard_deviation())
@@ -200,9 +233,12 @@ class BasisMoments:
     def _feed(self, rows: np.ndarray) -> None:
         assert self.expansions is not None
         of_dynamics, of_reward = self.expansions
-        for start in range(0, len(rows), FEED_ROWS):
-            part = rows[start : start + FEED_ROWS]
+        for part in _in_parts(rows):
             features = of_dynamics.features(of_dynamics.standardise(part[:, self.inputs_of_dynamics]))
             self.dynamics.update(np.concatenate([features, part[:, self.variables.next_state]], axis=1))
             features = of_reward.features(of_reward.standardise(part[:, self.inputs_of_reward]))
             self.reward.update(np.concatenate([features, part[:, [self.variables.reward]]], axis=1))
+
+
+def _in_parts(rows: np.ndarray) -> list[np.ndarray]:
+    return [rows[first : first + FEED_ROWS] for first in range(0, len(rows), FEED_ROWS)]

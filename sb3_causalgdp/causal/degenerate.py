@@ -12,7 +12,7 @@ SMALLEST_COEFFICIENT = 1e-3
 class Degeneracy:
     """
     :param kept: Indices of linearly independent variables that span all that move
-    :param groups: Groups of indices, each of at least two variables that are linearly dependent, the kept ones among them first
+    :param groups: Groups of indices, each of at least two variables that are linearly dependent, the kept ones first
     :param stand_in: For each variable outside ``kept`` that moves, the kept one that says most about it, and the sign
     """
 

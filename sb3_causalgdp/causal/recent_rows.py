@@ -96,3 +96,19 @@ class RecentRows:
         :return: moments of the stream
         """
         return self.moments.total()
+
+
+def checked_rows(statistics: RecentRows, variables: TransitionVariables, method: str, needed: int) -> np.ndarray:
+    """
+    :param statistics: What a method that needs rows has been given
+    :param variables: Names and order of the variables
+    :param method: Its name, for the error
+    :param needed: Number of rows that it needs at least
+    :return: the rows that are kept, shape (N, 2 n + d + 1)
+    :raises ValueError: on fewer rows, or when the statistics are not of these variables
+    """
+    if not isinstance(statistics, RecentRows) or statistics.variables != variables:
+        raise ValueError(f"statistics must be those that make_statistics makes for {variables.names}, got {statistics!r}")
+    if len(statistics) < needed:
+        raise ValueError(f"{method} needs at least {needed} rows, got {len(statistics)}")
+    return statistics.rows()

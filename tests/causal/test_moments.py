@@ -45,6 +45,127 @@ def test_half_life_weighs_old_rows_less():
     assert moments.n_samples == 300
 
 
+def assert_of_rows(moments, rows, weights=None):
+    np.testing.assert_allclose(moments.count, len(rows) if weights is None else weights.sum())
+    np.testing.assert_allclose(moments.mean, np.average(rows, axis=0, weights=weights))
+    np.testing.assert_allclose(moments.covariance(), np.cov(rows.T, aweights=weights, ddof=0), rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("batch", [1, 7, 1000])
+@pytest.mark.parametrize("n_blocks", [2, 4, 8])
+def test_merging_blocks_forgets_nothing(n_blocks, batch):
+    rows = np.random.default_rng(0).normal(size=(1000, 3)) + 3.0
+    moments = moments_of(rows, batch, n_blocks=n_blocks)
+    assert_of_rows(moments, rows)
+    assert n_blocks // 2 < moments.n_filled <= n_blocks
+
+
+@pytest.mark.parametrize("batch", [1, 7, 1000])
+def test_a_window_forgets_the_oldest_block(batch):
+    rows = np.random.default_rng(0).normal(size=(1000, 3))
+    moments = StreamingMoments(3, window=100, n_blocks=4)
+    moments.update(rows[:100])
+    assert_of_rows(moments, rows[:100])
+    moments.update(rows[100:101])
+    assert_of_rows(moments, rows[25:101])
+    moments = moments_of(rows[:990], batch, window=100, n_blocks=4)
+    assert_of_rows(moments, rows[900:990])
+    assert moments.n_samples == 990
+
+
+@pytest.mark.parametrize("window", [None, 200])
+def test_half_life_with_blocks_weighs_rows_by_their_age(window):
+    rows = np.random.default_rng(0).normal(size=(400, 2))
+    moments = moments_of(rows, batch=20, half_life=60.0, window=window, n_blocks=8)
+    weights = np.repeat(0.5 ** (20.0 * np.arange(20)[::-1] / 60.0), 20)
+    kept = slice(None) if window is None else slice(-200, None)
+    assert_of_rows(moments, rows[kept], weights[kept])
+
+
+@pytest.mark.parametrize("n_blocks", [4, 8])
+def test_half_life_leaves_weight_in_several_blocks(n_blocks):
+    moments = moments_of(np.random.default_rng(0).normal(size=(20_000, 2)), batch=100, half_life=500, n_blocks=n_blocks)
+    shares = [share for _, share in moments.leave_one_out()]
+    assert len(shares) == n_blocks
+    np.testing.assert_allclose(sum(shares), 1.0)
+    assert max(shares) < 0.8
+
+
+def test_rows_of_no_weight_are_gone():
+    moments = StreamingMoments(2, half_life=1.0, n_blocks=4)
+    moments.update(np.random.default_rng(0).normal(size=(50, 2)))
+    rows = np.random.default_rng(1).normal(size=(5000, 2))
+    moments.update(rows)
+    assert_of_rows(moments, rows)
+    assert all(0.0 < share < 1.0 for _, share in moments.leave_one_out())
+
+
+def test_leaving_a_block_out_equals_numpy_on_the_other_rows():
+    rows = np.random.default_rng(0).normal(size=(150, 3)) + np.linspace(0.0, 5.0, 150)[:, None]
+    parts = moments_of(rows, batch=11, n_blocks=4).leave_one_out()
+    first_rows = [0, 64, 128, 150]  # two blocks of 8 rows, doubled three times, and one that is not full
+    assert len(parts) == 3
+    for i, (rest, share) in enumerate(parts):
+        block = np.arange(first_rows[i], first_rows[i + 1])
+        assert_of_rows(rest, np.delete(rows, block, axis=0))
+        assert share == pytest.approx(len(block) / 150)
+
+
+def test_one_block_cannot_be_left_out():
+    assert StreamingMoments(2, n_blocks=4).leave_one_out() == []
+    assert moments_of(np.ones((5, 2)), n_blocks=4).leave_one_out() == []
+    assert moments_of(np.ones((500, 2))).leave_one_out() == []
+
+
+def test_a_block_with_all_of_a_variance_leaves_none_behind():
+    rows = np.random.default_rng(0).normal(size=(512, 2))
+    rows[:, 1] = 0.1
+    rows[70:80, 1] = 1e6
+    parts = moments_of(rows, n_blocks=8).leave_one_out()
+    left = [rest.covariance()[1, 1] for rest, _ in parts]
+    assert left[1] == 0.0 and min(left[:1] + left[2:]) > 0.0
+
+
+@pytest.mark.parametrize("batch", [1, 100])
+def test_blocks_stay_accurate_with_a_large_mean_and_a_small_deviation(batch):
+    rows = 1e6 + 1e-3 * np.random.default_rng(0).normal(size=(3000, 2))
+    moments = moments_of(rows, batch, n_blocks=8)
+    everything = [(moments, rows)]
+    for i, (rest, _) in enumerate(moments.leave_one_out()):
+        everything.append((rest, np.delete(rows, np.arange(512 * i, min(512 * (i + 1), 3000)), axis=0)))
+    assert len(everything) == 7
+    for estimate, kept in everything:
+        exact = np.cov((kept - 1e6).T, ddof=0)
+        np.testing.assert_allclose(estimate.covariance(), exact, rtol=1e-6, atol=1e-6 * exact[0, 0])
+
+
+@pytest.mark.parametrize("kwargs", [{}, {"window": 1000}, {"half_life": 300.0}])
+def test_memory_does_not_grow_with_the_rows(kwargs):
+    moments, sizes = StreamingMoments(3, n_blocks=8, **kwargs), []
+    for n_rows in (2000, 60_000):
+        moments.update(np.random.default_rng(0).normal(size=(n_rows, 3)))
+        sizes.append(len(pickle.dumps(moments)))
+        assert moments.n_filled <= 8
+    assert sizes[1] < 2 * sizes[0]
+
+
+def test_what_was_read_does_not_change_with_later_rows():
+    moments = moments_of(np.random.default_rng(0).normal(size=(100, 2)))
+    total = moments.total()
+    before = pickle.dumps(total)
+    moments.update(np.ones((5, 2)))
+    assert pickle.dumps(total) == before
+
+
+def test_clear_forgets_all_rows():
+    rows = np.random.default_rng(0).normal(size=(300, 2))
+    moments = moments_of(np.ones((1000, 2)), n_blocks=4)
+    moments.clear()
+    moments.update(rows)
+    assert_of_rows(moments, rows)
+    assert moments.n_samples == 300
+
+
 def test_constant_columns_have_zero_correlation():
     rows = np.random.default_rng(0).normal(size=(100, 4))
     rows[:, 1] = 0.1
@@ -77,12 +198,14 @@ def test_update_leaves_the_rows_alone_and_takes_an_empty_batch():
     assert moments.n_samples == 10
 
 
-def test_pickle_keeps_the_moments():
-    moments = moments_of(np.random.default_rng(0).normal(size=(10, 2)), half_life=20.0)
+@pytest.mark.parametrize("kwargs", [{}, {"half_life": 20.0}, {"n_blocks": 4}, {"window": 12, "n_blocks": 4}])
+def test_pickle_keeps_the_moments(kwargs):
+    moments = moments_of(np.random.default_rng(0).normal(size=(30, 2)), batch=7, **kwargs)
     loaded = pickle.loads(pickle.dumps(moments))
     loaded.update(np.ones((3, 2)))
     moments.update(np.ones((3, 2)))
     np.testing.assert_array_equal(loaded.covariance(), moments.covariance())
+    assert len(loaded.leave_one_out()) == len(moments.leave_one_out())
 
 
 @pytest.mark.parametrize("shape", [(3,), (2, 4), (1, 2, 3)])
@@ -104,6 +227,11 @@ def test_no_rows_is_an_error():
         ({"n_variables": 2, "half_life": 0}, ValueError, "half_life"),
         ({"n_variables": 2, "half_life": "1e5"}, ValueError, "half_life"),
         ({"n_variables": 2, "names": ["x"]}, ValueError, "names"),
+        ({"n_variables": 2, "n_blocks": 3}, ValueError, "n_blocks"),
+        ({"n_variables": 2, "n_blocks": 0}, ValueError, "n_blocks"),
+        ({"n_variables": 2, "window": 7}, ValueError, "window"),
+        ({"n_variables": 2, "window": 7, "n_blocks": 1}, ValueError, "window"),
+        ({"n_variables": 2, "window": "1e5"}, ValueError, "window"),
     ],
 )
 def test_bad_arguments_are_errors(kwargs, error, message):

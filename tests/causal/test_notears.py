@@ -1,4 +1,5 @@
 import itertools
+import pickle
 import warnings
 
 import numpy as np
@@ -7,6 +8,7 @@ from sklearn.linear_model import Lasso
 from sklearn.metrics import roc_auc_score
 
 from sb3_causalgdp.causal import DISCOVERY_METHODS, CausalGraph, StreamingMoments, TransitionVariables, make_discovery
+from sb3_causalgdp.causal.discovery.acyclic import acyclicity, is_acyclic, without_cycles
 from sb3_causalgdp.causal.discovery.lasso import solve_lasso_gram
 from sb3_causalgdp.causal.discovery.notears import Notears
 
@@ -202,6 +204,109 @@ def test_too_few_rows_is_an_error_that_says_how_many():
     with pytest.raises(ValueError, match=r"at least 7 rows .* got 6"):
         Notears()(moments_of(np.random.default_rng(0).normal(size=(6, 9))), variables)
     Notears()(moments_of(np.random.default_rng(0).normal(size=(7, 9))), variables)
+
+
+def test_without_sparsity_it_is_least_squares():
+    variables, rows, _ = linear_system(seed=0, n_rows=500)
+    graph = Notears(sparsity=0.0)(moments_of(rows), variables)
+    standardised = (rows - rows.mean(axis=0)) / rows.std(axis=0)
+    expected = np.linalg.lstsq(standardised[:, :14], standardised[:, 14:24], rcond=None)[0].T
+    np.testing.assert_allclose(graph.effects[:10], expected, atol=1e-8)
+    residual = standardised[:, 14:24] - standardised[:, :14] @ expected.T
+    np.testing.assert_allclose(graph.r_squared[:10], 1.0 - residual.var(axis=0), atol=1e-8)
+
+
+def test_linearly_dependent_causes_share_a_mask():
+    variables, rows, _ = linear_system(seed=0, n_rows=2_000, n_states=4, n_actions=2)
+    rows[:, 1] = -3.0 * rows[:, 0]
+    rows[:, 7] = -3.0 * rows[:, 6]
+    graph = Notears()(moments_of(rows), variables)
+    assert graph.duplicated_variables == (("s0", "s1"),)
+    np.testing.assert_array_equal(graph.masks[:, 0], graph.masks[:, 1])
+    np.testing.assert_array_equal(graph.effects[:, 0], -graph.effects[:, 1])
+    assert graph.action_vif == pytest.approx([1.0, 1.0], abs=0.05)
+
+
+@pytest.mark.parametrize("standardize", [True, False])
+def test_standard_errors_are_the_spread_over_repetitions(standardize):
+    effects, errors = [], []
+    _, rows, _ = linear_system(seed=0, n_rows=8_000, n_states=4, n_actions=2)
+    for seed in range(40):
+        chosen = np.random.default_rng(seed).integers(0, len(rows), 2_000)
+        moments = StreamingMoments(rows.shape[1], n_blocks=20)
+        moments.update(rows[chosen])
+        graph = Notears(sparsity=0.005, standardize=standardize)(moments, make_variables(4, 2))
+        effects.append(graph.effects)
+        errors.append(graph.standard_errors)
+    steady = (np.stack(effects) != 0).all(axis=0)
+    ratio = np.mean(errors, axis=0)[steady] / np.std(effects, axis=0)[steady]
+    assert steady.sum() >= 8 and 0.8 < ratio.mean() < 1.2
+    assert np.mean(errors, axis=0).min() > 0
+
+
+def test_one_block_gives_no_standard_errors():
+    variables, rows, _ = linear_system(seed=0, n_rows=100)
+    assert Notears()(moments_of(rows), variables).standard_errors is None
+
+
+def simultaneous_system(n_rows=5_000, seed=0):
+    """s1' <- s0' at once, s2' <- s1' at once, each from itself one step before; a0 moves s0' alone."""
+    rng = np.random.default_rng(seed)
+    states, actions = rng.normal(size=(n_rows, 3)), rng.uniform(-1, 1, (n_rows, 1))
+    noise = rng.normal(size=(n_rows, 3))
+    first = 0.5 * states[:, 0] + actions[:, 0] + noise[:, 0]
+    second = 0.5 * states[:, 1] + 0.9 * first + noise[:, 1]
+    third = 0.5 * states[:, 2] - 0.9 * second + noise[:, 2]
+    variables = make_variables(3, 1)
+    return variables, variables.stack(states, actions, np.stack([first, second, third], axis=1), third)
+
+
+def test_finds_edges_among_simultaneous_variables():
+    variables, rows = simultaneous_system()
+    method = Notears(standardize=False, instantaneous=True)
+    graph = method(moments_of(rows), variables)
+    scale = rows.std(axis=0)
+    expected = np.array([[0, 0, 0], [0.9, 0, 0], [0, -0.9, 0]]) * scale[4:7] / scale[4:7, None]
+    np.testing.assert_allclose(method.instantaneous_weights, expected, atol=0.05)
+    # Over all paths: a0 reaches s2' through s0' and s1'
+    assert graph.effects[2, 3] == pytest.approx(-0.81 * scale[3] / scale[6], abs=0.05)
+    assert graph.effects[0, 1] == 0.0
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_edges_among_simultaneous_variables_have_no_cycle(seed):
+    variables, rows, _ = linear_system(seed, n_rows=60, n_states=6, n_actions=2)
+    rows[:, variables.next_state] += np.random.default_rng(seed).normal(size=(60, 1))
+    method = Notears(instantaneous=True)
+    method(moments_of(rows), variables)
+    assert method.instantaneous_weights.any()
+    assert is_acyclic(method.instantaneous_weights != 0)
+
+
+def test_acyclicity_is_zero_without_cycles_alone_and_has_the_right_gradient():
+    rng = np.random.default_rng(0)
+    acyclic = np.tril(rng.normal(size=(5, 5)), -1)
+    weights = rng.normal(size=(4, 4)) / 2
+    assert acyclicity(acyclic)[0] == pytest.approx(0.0, abs=1e-12) and acyclicity(weights)[0] > 0.1
+    assert is_acyclic(acyclic != 0) and not is_acyclic(weights != 0)
+    step = 1e-6 * np.eye(16).reshape(16, 4, 4)
+    numeric = [(acyclicity(weights + e)[0] - acyclicity(weights - e)[0]) / 2e-6 for e in step]
+    np.testing.assert_allclose(acyclicity(weights)[1].ravel(), numeric, rtol=1e-5)
+
+
+def test_weakest_edges_go_until_no_cycle_is_left():
+    weights = np.array([[0.0, 0.5, 0.0], [0.3, 0.0, 0.0], [0.0, 0.01, 0.0]])
+    np.testing.assert_array_equal(without_cycles(weights, 0.1), [[0, 0.5, 0], [0, 0, 0], [0, 0, 0]])
+
+
+def test_pickled_method_finds_the_same_graph():
+    variables, rows = simultaneous_system(500)
+    moments = moments_of(rows)
+    method = Notears(instantaneous=True)
+    graph = method(moments, variables)
+    copied = pickle.loads(pickle.dumps(method))
+    np.testing.assert_array_equal(copied.instantaneous_weights, method.instantaneous_weights)
+    np.testing.assert_array_equal(copied(moments, variables).effects, graph.effects)
 
 
 def test_other_variables_are_an_error():

@@ -6,18 +6,24 @@ from typing import Any, Protocol
 
 import numpy.typing as npt
 
+from sb3_causalgdp.causal.discovery.lingam import DirectLingam
 from sb3_causalgdp.causal.discovery.notears import Notears
 from sb3_causalgdp.causal.discovery.partial_r2 import PartialR2
+from sb3_causalgdp.causal.discovery.perturbed import Perturbed
+from sb3_causalgdp.causal.discovery.world_model import WorldModelEffects
 from sb3_causalgdp.causal.graph import CausalGraph
 from sb3_causalgdp.causal.moments import StreamingMoments
 from sb3_causalgdp.causal.variables import TransitionVariables
 
 __all__ = [
     "DISCOVERY_METHODS",
+    "DirectLingam",
     "DiscoveryMethod",
     "Notears",
     "PartialR2",
+    "Perturbed",
     "Statistics",
+    "WorldModelEffects",
     "discover",
     "make_discovery",
     "make_statistics",
@@ -45,10 +51,16 @@ class DiscoveryMethod(Protocol):
     ) -> CausalGraph: ...
 
 
-DISCOVERY_METHODS: dict[str, type] = {"notears": Notears, "partial_r2": PartialR2}
+DISCOVERY_METHODS: dict[str, type] = {
+    "direct_lingam": DirectLingam,
+    "notears": Notears,
+    "partial_r2": PartialR2,
+    "perturbed": Perturbed,
+    "world_model": WorldModelEffects,
+}
 
 
-def make_discovery(method: str | Callable[..., CausalGraph], **kwargs: Any) -> DiscoveryMethod:
+def make_discovery(method: str | Callable[..., CausalGraph], /, **kwargs: Any) -> DiscoveryMethod:
     """
     Build a discovery method by name.
 
@@ -63,9 +75,11 @@ def make_discovery(method: str | Callable[..., CausalGraph], **kwargs: Any) -> D
         return method
     if method not in DISCOVERY_METHODS:
         raise ValueError(f"unknown discovery method {method!r}, known are {sorted(DISCOVERY_METHODS)}")
-    accepted = list(inspect.signature(DISCOVERY_METHODS[method]).parameters)
+    parameters = inspect.signature(DISCOVERY_METHODS[method]).parameters
+    accepted = [name for name, parameter in parameters.items() if parameter.kind is not parameter.VAR_KEYWORD]
     unknown = sorted(set(kwargs) - set(accepted))
-    if unknown:
+    # A method with arguments of its own kind, as a wrapper has, checks them itself
+    if unknown and len(accepted) == len(parameters):
         raise ValueError(f"unknown arguments {unknown} for discovery method {method!r}, accepted are {accepted}")
     return DISCOVERY_METHODS[method](**kwargs)
 
@@ -86,7 +100,7 @@ def make_statistics(
 
 
 def discover(
-    method: str | Callable[..., CausalGraph], rows: npt.ArrayLike, variables: TransitionVariables, **kwargs: Any
+    method: str | Callable[..., CausalGraph], rows: npt.ArrayLike, variables: TransitionVariables, /, **kwargs: Any
 ) -> CausalGraph:
     """
     Find the graph of recorded transitions, in one call.

@@ -25,10 +25,8 @@ def is_acyclic(edges: np.ndarray) -> bool:
     left = edges.copy()
     while left.any():
         # Whatever has no parents, or no children, is in no cycle
-        inside = left.any(axis=0) & left.any(axis=1)
-        if inside.all():
-            return False
-        pruned = left & inside[:, None] & inside
+        inside = np.logical_and(left.any(axis=0), left.any(axis=1))
+        pruned = left & np.outer(inside, inside)
         if np.array_equal(pruned, left):
             return False
         left = pruned
@@ -54,9 +52,9 @@ def without_cycles(weights: np.ndarray, threshold: float) -> np.ndarray:
 def notears(
     second_moments: np.ndarray,
     sparsity: float,
-    acyclicity_tolerance: float = 1e-9,
-    max_iterations: int = 500,
-    tolerance: float = 1e-6,
+    acyclicity_tolerance: float = 1e-6,
+    max_iterations: int = 300,
+    tolerance: float = 1e-5,
 ) -> np.ndarray:
     """
     Minimise ``1/2 tr((I - W) S (I - W)^T) + sparsity ||W||_1`` under ``h(W) = 0`` (Zheng et al., 2018,

@@ -114,7 +114,12 @@ def _fista(problem: _Problem, initial: np.ndarray, step: float, max_iterations: 
             current[:, settled[is_solved]] = exact[:, is_solved]
             open_[settled[is_solved]] = False
             weights[:, columns] = current
-            columns, problem, momentum, signs_then = columns[open_], problem.of_targets(open_), momentum[open_], signs[:, open_]
+            columns, problem, momentum, signs_then = (
+                columns[open_],
+                problem.of_targets(open_),
+                momentum[open_],
+                signs[:, open_],
+            )
             current, product = current[:, open_], product[:, open_]
             ahead, ahead_product = ahead[:, open_], ahead_product[:, open_]
         if len(columns) == 0 or iteration >= max_iterations:

@@ -23,6 +23,19 @@ class _Part(NamedTuple):
     groups: tuple[tuple[int, ...], ...]
 
 
+def weight_masks(weights: np.ndarray, edge_threshold: float, mask_scale: float) -> np.ndarray:
+    """
+    ``w^2 / (w^2 + mask_scale^2)``, and 0 where \\|w\\| < ``edge_threshold``.
+
+    :param weights: Weights in standardised units, any shape
+    :param edge_threshold: Smallest \\|w\\| of an open edge
+    :param mask_scale: The \\|w\\| at which a mask is one half
+    :return: masks in [0, 1), the same shape
+    """
+    squares = weights**2
+    return np.where(np.abs(weights) < edge_threshold, 0.0, squares / (squares + mask_scale**2))
+
+
 class Notears:
     """
     NOTEARS (Zheng et al., 2018, https://arxiv.org/abs/1803.01422) on the edges that time allows:
@@ -33,8 +46,8 @@ class Notears:
 
     With ``instantaneous``, edges s'_k -> s'_j are estimated as well, and there h(W) = 0 binds: NOTEARS on what (s_t, a_t)
     leaves of s_{t+1} finds their weights B, and a Lasso of (I - B) s_{t+1} on (s_t, a_t) finds the direct weights A. The graph
-    holds the effects over all paths, ``(I - B)^{-1} A``: those are what a model of s_{t+1} given (s_t, a_t) alone needs. B itself
-    is left in the attribute ``instantaneous_weights``.
+    holds the effects over all paths, ``(I - B)^{-1} A``: those are what a model of s_{t+1} given (s_t, a_t) alone needs. B
+    itself is left in the attribute ``instantaneous_weights``.
 
     A weight w (in standardised units) becomes a mask by one map: 0 where \\|w\\| < ``edge_threshold``, otherwise
     ``w^2 / (w^2 + mask_scale^2)``, which is half at \\|w\\| = ``mask_scale`` and, by default, 0.90 at 0.15 and 0.99 at 0.5.
@@ -127,8 +140,7 @@ class Notears:
         :param weights: Weights in standardised units, any shape
         :return: masks in [0, 1), the same shape
         """
-        squares = weights**2
-        return np.where(np.abs(weights) < self.edge_threshold, 0.0, squares / (squares + self.mask_scale**2))
+        return weight_masks(weights, self.edge_threshold, self.mask_scale)
 
     def _check(self, moments: StreamingMoments, variables: TransitionVariables, previous: CausalGraph | None) -> None:
         if moments.n_variables != variables.n_variables:
@@ -233,10 +245,14 @@ class _Standardised:
         everything = self.second_moments(columns, columns)
         gram = everything[: len(inputs), : len(inputs)]
         gradients = np.empty((len(parts), *weights.shape))
-        for gradient, (rest, _) in zip(gradients, parts, strict=True):
+        units = np.empty_like(gradients)
+        for gradient, unit, (rest, _) in zip(gradients, units, parts, strict=True):
             factor = inverse_scale[columns]
             covariance = rest.covariance()[np.ix_(columns, columns)] * np.outer(factor, factor)
             gradient[:] = residual_of @ (covariance - everything)[:, : len(inputs)]
+            # A standard deviation, the unit of an effect, is an estimate as well
+            deviation = np.sqrt(np.diagonal(covariance) / np.diagonal(everything))
+            unit[:] = deviation[: len(inputs)] / np.maximum(deviation[len(inputs) :, None], np.finfo(np.float64).tiny)
         changes = np.zeros_like(gradients)
         for target, row in enumerate(weights):
             support, closed = np.flatnonzero(row), np.flatnonzero(row == 0.0)
@@ -244,4 +260,4 @@ class _Standardised:
             changes[:, target, closed] = -(slopes[closed] / np.diagonal(gram)[closed, None]).T
             if len(support):
                 changes[:, target, support] = -least_squares_gram(gram[np.ix_(support, support)], slopes[support]).T
-        return jackknife_error(weights, list(weights + changes), [share for _, share in parts])
+        return jackknife_error(weights, list((weights + changes) * units), [share for _, share in parts])

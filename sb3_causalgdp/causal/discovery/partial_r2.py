@@ -1,6 +1,6 @@
 import warnings
-from dataclasses import dataclass
 from datetime import datetime, timezone
+from typing import NamedTuple
 
 import numpy as np
 import torch as th
@@ -8,13 +8,16 @@ import torch as th
 from sb3_causalgdp.causal.basis import BasisExpansion, BasisMoments
 from sb3_causalgdp.causal.degenerate import Degeneracy, find_degeneracy, variance_inflation
 from sb3_causalgdp.causal.graph import CausalGraph
-from sb3_causalgdp.causal.moments import Moments
+from sb3_causalgdp.causal.jackknife import jackknife_error
+from sb3_causalgdp.causal.moments import Moments, StreamingMoments
 from sb3_causalgdp.causal.variables import TransitionVariables
 
 RIDGE = 1e-9
 SMALLEST_RESIDUAL = 1e-9  # of the target's variance: what float32 rounding and the ridge leave of an exact function
+SMALLEST_DEVIATION = 1e-9  # in units of the standard deviation of all rows: below it, a column does not move in these rows
 FLOOR_SHARE = 1.0 / 30.0  # of the threshold: below it, the noise of the logarithm says nothing
 CONFOUNDED_VIF = 40.0
+THINNING = 8
 
 
 def edge_probability(partial_r2: np.ndarray, log_error: np.ndarray, threshold: float, spread: float) -> np.ndarray:
@@ -34,15 +37,6 @@ def edge_probability(partial_r2: np.ndarray, log_error: np.ndarray, threshold: f
     return np.where(present & (probability >= 1e-3), probability, 0.0)
 
 
-@dataclass
-class _Regression:
-    """Of m targets on the features: partial R^2, effects and R^2, from one set of moments."""
-
-    partial_r2: np.ndarray  # (m, p)
-    effects: np.ndarray  # (m, p)
-    r_squared: np.ndarray  # (m,)
-
-
 class PartialR2:
     """
     Nonlinear discovery: how much of what the other causes leave does each cause explain?
@@ -54,17 +48,20 @@ class PartialR2:
     number of features.
 
     A mask is the probability ``Phi[ln(partial R^2 / threshold) / sqrt(se^2 + spread^2)]``, with the standard error of the
-    logarithm by block jackknife (Busing, Meijer and van der Leeden, 1999). An effect is the mean difference of the target, in
+    logarithm by block jackknife (Busing, Meijer and van der Leeden, 1999). An effect is the difference of the target, in
     its standard deviations, when a cause moves from half a standard deviation below to half a one above, the others as they
-    are: its size is the mean of the absolute difference, its sign that of the mean, so an even function has an effect too.
+    are: its size is the mean of the absolute difference over the newest 256 rows, its sign that of the mean, so an even
+    function has an effect too. R^2 is adjusted for the number of features as well.
 
-    Linearly dependent variables are tested as a group and share its masks; variables that never move have no edges.
+    Linearly dependent variables are tested as a group and share its masks; variables that never move have no edges. Where rows
+    are few, the products are left out, then sine and tanh, then the square, so that there are two rows for each feature.
 
     :param threshold: Partial R^2 at which a mask is one half, in (0, 1)
     :param spread: Uncertainty of the mask in ln(partial R^2), beside that of the sample, positive
     :param products: Whether products of pairs are among the features; None: where states and actions are at most 60
     :param max_memory: Bytes that the moments may take
-    :param on_degenerate: ``share`` lets linearly dependent variables share a mask, ``raise`` is an error that names them
+    :param on_degenerate: ``share`` lets linearly dependent causes share a mask and gives constant ones none, ``raise`` is an
+        error that names both
     """
 
     def __init__(
@@ -109,204 +106,284 @@ class PartialR2:
         :param variables: Names and order of the variables
         :param previous: Not used: there is a closed form
         :return: the graph
-        :raises ValueError: on fewer than 2 (n + d) + 4 rows, when the arguments are not about the same variables, or on
-            linearly dependent variables if ``on_degenerate="raise"``
+        :raises ValueError: on fewer than 2 (n + d) + 4 rows that are not forgotten, when the arguments are not about the same
+            variables, or on linearly dependent or constant causes if ``on_degenerate="raise"``
         """
-        if not isinstance(statistics, BasisMoments) or statistics.variables != variables:
-            raise ValueError(f"statistics must be those that make_statistics makes for {variables.names}, got {statistics!r}")
-        statistics.start()
-        n_states = variables.n_states
-        needed = 2 * (n_states + variables.n_actions) + 4
-        n_rows = statistics.dynamics.n_samples
-        if n_rows < needed:
-            raise ValueError(f"partial_r2 needs at least {needed} rows (2 (states + actions) + 4), got {n_rows}")
-        assert statistics.expansions is not None
+        self._check(statistics, variables)
         raw = statistics.raw.correlation()
-        parts = []
-        sources = (
-            (statistics.dynamics, statistics.inputs_of_dynamics, np.arange(variables.n_variables)[variables.next_state]),
-            (statistics.reward, statistics.inputs_of_reward, np.array([variables.reward])),
-        )
-        for (moments, inputs, targets), expansion in zip(sources, statistics.expansions, strict=True):
-            degeneracy = find_degeneracy(raw[np.ix_(inputs, inputs)])
-            system = _System(statistics, expansion, degeneracy, inputs, targets)
-            parts.append((degeneracy, *self._estimate(moments, system)))
-        self._check(statistics, parts)
-        vif = variance_inflation(raw[: n_states + variables.n_actions, : n_states + variables.n_actions])[n_states:]
-        self._say_confounded(vif, variables)
-        input_names = (*variables.state_names, *variables.action_names)
+        causes = (statistics.inputs_of_dynamics, statistics.inputs_of_reward)
+        of_dynamics, of_reward = (find_degeneracy(raw[np.ix_(inputs, inputs)]) for inputs in causes)
+        constant = tuple(np.array(variables.names)[statistics.raw.constant].tolist())
+        duplicated = _names_of_duplicates(of_dynamics, of_reward, variables)
+        if self.on_degenerate == "raise":
+            _refuse_degenerate(set(constant) & {*variables.state_names, *variables.action_names}, duplicated)
+        inflation = variance_inflation(raw[np.ix_(causes[0], causes[0])])[variables.n_states :]
+        self._say_confounded(inflation, variables)
+        rows = [
+            self._estimate(statistics.dynamics, _dynamics(statistics, of_dynamics)),
+            self._estimate(statistics.reward, _reward(statistics, of_reward)),
+        ]
+        masks, effects, errors, r_squared = (np.concatenate(parts) for parts in zip(*rows, strict=True))
         return CausalGraph(
             variables,
-            masks=np.concatenate([part[1] for part in parts]),
-            effects=np.concatenate([part[2] for part in parts]),
-            standard_errors=np.concatenate([part[3] for part in parts]),
-            r_squared=np.concatenate([part[4] for part in parts]),
-            action_vif=vif,
+            masks=masks,
+            effects=effects,
+            standard_errors=errors,
+            r_squared=r_squared,
+            action_vif=inflation,
             method="partial_r2",
-            n_samples=n_rows,
-            constant_variables=tuple(np.array(variables.names)[statistics.raw.constant].tolist()),
-            duplicated_variables=parts[0][0].names_of_groups(input_names),
+            n_samples=statistics.dynamics.n_samples,
+            constant_variables=constant,
+            duplicated_variables=duplicated,
             found_at=datetime.now(timezone.utc).isoformat(timespec="seconds"),
         )
 
-    def _estimate(self, moments, system: "_System") -> tuple[np.ndarray, ...]:
-        """Masks, effects, standard errors of the effects, and R^2, of one set of targets."""
-        whole = system.regress(moments.total())
+    def _estimate(self, moments: StreamingMoments, regression: "_Regression") -> tuple[np.ndarray, ...]:
+        """Masks, effects, standard errors of the effects, and R^2."""
+        whole = regression.whole
         parts, shares = [], []
-        for rest, share in moments.leave_one_out():
-            parts.append(system.regress(rest))
+        for i in range(moments.n_filled if moments.n_filled > 1 else 0):
+            rest, share = moments.without_block(i)
+            parts.append(regression.estimate(rest))
             shares.append(share)
-        log_error = _jackknife_error(self._log(whole), [self._log(part) for part in parts], shares)
-        error = _jackknife_error(whole.effects, [part.effects for part in parts], shares)
+        log_error = jackknife_error(self._log(whole), [self._log(part) for part in parts], shares)
+        error = jackknife_error(whole.effects, [part.effects for part in parts], shares)
         masks = edge_probability(whole.partial_r2, log_error, self.threshold, self.spread)
-        return system.degeneracy.share(masks), whole.effects, error, whole.r_squared
+        return masks, whole.effects, error, whole.r_squared
 
-    def _log(self, regression: "_Regression") -> np.ndarray:
-        return np.log(np.maximum(regression.partial_r2, FLOOR_SHARE * self.threshold))
+    def _log(self, estimates: "_Estimates") -> np.ndarray:
+        return np.log(np.maximum(estimates.partial_r2, FLOOR_SHARE * self.threshold))
 
-    def _check(self, statistics: BasisMoments, parts) -> None:
-        groups = parts[0][0].groups
-        constant = np.array(statistics.variables.names)[statistics.raw.constant]
-        if self.on_degenerate == "raise" and (groups or len(constant)):
-            names = (*statistics.variables.state_names, *statistics.variables.action_names)
+    def _check(self, statistics: BasisMoments, variables: TransitionVariables) -> None:
+        if not isinstance(statistics, BasisMoments) or statistics.variables != variables:
+            raise ValueError(f"statistics must be those that make_statistics makes for {variables.names}, got {statistics!r}")
+        statistics.start()
+        needed = 2 * (variables.n_states + variables.n_actions) + 4
+        n_rows = statistics.dynamics.count
+        # Weights of a half-life do not add up to an integer
+        if n_rows < needed - 0.5:
             raise ValueError(
-                f"variables cannot be told apart: constant {constant.tolist()}, "
-                f"linearly dependent {[list(group) for group in parts[0][0].names_of_groups(names)]}"
+                f"partial_r2 needs at least {needed} rows (2 (states + actions) + 4) that are not forgotten, got {n_rows:.0f}"
             )
 
-    def _say_confounded(self, vif: np.ndarray, variables: TransitionVariables) -> None:
-        if self._said_confounded or vif.max() <= CONFOUNDED_VIF:
+    def _say_confounded(self, inflation: np.ndarray, variables: TransitionVariables) -> None:
+        if self._said_confounded or inflation.max() <= CONFOUNDED_VIF:
             return
         self._said_confounded = True
-        named = ", ".join(f"{variables.action_names[i]} ({vif[i]:.3g})" for i in np.flatnonzero(vif > CONFOUNDED_VIF))
+        over = np.flatnonzero(inflation > CONFOUNDED_VIF)
+        named = ", ".join(f"{variables.action_names[i]} ({inflation[i]:.3g})" for i in over)
         warnings.warn(
-            f"The states almost determine the actions (variance inflation over {CONFOUNDED_VIF:g}): {named}. Their effects cannot "
-            "be told from those of the states; more exploration noise in the data would help.",
+            f"The states almost determine the actions (variance inflation over {CONFOUNDED_VIF:g}): {named}. Their effects "
+            "cannot be told from those of the states; more exploration noise in the data would help.",
             stacklevel=3,
         )
 
 
-class _System:
-    """The regression of some targets on the features of their possible causes, for any moments of these."""
+def _names_of_duplicates(
+    of_dynamics: Degeneracy, of_reward: Degeneracy, variables: TransitionVariables
+) -> tuple[tuple[str, ...], ...]:
+    """Groups among (s, a), and those that are among (s', a) alone."""
+    before = (*variables.state_names, *variables.action_names)
+    after = (*variables.next_state_names, *variables.action_names)
+    known = {tuple(sorted(group)) for group in of_dynamics.groups}
+    groups = [*of_dynamics.names_of_groups(before)]
+    for group, names in zip(of_reward.groups, of_reward.names_of_groups(after), strict=True):
+        if tuple(sorted(group)) not in known:
+            groups.append(names)
+    return tuple(groups)
+
+
+def _refuse_degenerate(constant: set[str], duplicated: tuple[tuple[str, ...], ...]) -> None:
+    if constant or duplicated:
+        raise ValueError(
+            f"causes cannot be told apart: constant {sorted(constant)}, linearly dependent {[list(g) for g in duplicated]}"
+        )
+
+
+class _Estimates(NamedTuple):
+    """Of m targets and their p possible causes: partial R^2 (m, p), effects (m, p), R^2 (m,)."""
+
+    partial_r2: np.ndarray
+    effects: np.ndarray
+    r_squared: np.ndarray
+
+
+class _Group(NamedTuple):
+    """
+    Causes that are tested alike, each with g features, or together.
+
+    :param causes: Indices of q causes; of one group of duplicates, whose features are one row below
+    :param features: Indices of their features, shape (q, g), or (1, g)
+    :param spread: Covariance of these features given all others, ``[(S^-1)_GG]^-1``, shape (q, g, g), or (1, g, g)
+    """
+
+    causes: list[int]
+    features: th.Tensor
+    spread: th.Tensor
+
+
+class _Fit(NamedTuple):
+    """
+    Least squares for m targets.
+
+    :param coefficients: In units of the features' and the targets' standard deviations in all rows, shape (F, m)
+    :param deviation: Standard deviations of the features in these rows, in the same units, shape (F,)
+    :param variance: Of the targets in these rows, in the same units, shape (m,)
+    :param residual: Variance that the features leave, shape (m,)
+    :param freedom: Rows less features less 1, at least 1
+    """
+
+    coefficients: th.Tensor
+    deviation: np.ndarray
+    variance: np.ndarray
+    residual: np.ndarray
+    freedom: float
+
+
+def _dynamics(statistics: BasisMoments, degeneracy: Degeneracy) -> "_Regression":
+    assert statistics.expansions is not None
+    targets = np.arange(statistics.variables.n_variables)[statistics.variables.next_state]
+    moments, inputs = statistics.dynamics.total(), statistics.inputs_of_dynamics
+    return _Regression(statistics, moments, statistics.expansions[0], inputs, targets, degeneracy)
+
+
+def _reward(statistics: BasisMoments, degeneracy: Degeneracy) -> "_Regression":
+    assert statistics.expansions is not None
+    targets = np.array([statistics.variables.reward])
+    moments, inputs = statistics.reward.total(), statistics.inputs_of_reward
+    return _Regression(statistics, moments, statistics.expansions[1], inputs, targets, degeneracy)
+
+
+class _Regression:
+    """
+    Regresses some targets on the features of their possible causes: on all rows, and then on parts of them.
+
+    The covariance of a cause's features given all others is that of all rows: its error is far smaller than that of the
+    coefficients, and the parts need no inverse.
+
+    :param statistics: Where the scales and the newest rows come from
+    :param moments: Of the features and, behind them, the targets, of all rows
+    :param expansion: The features
+    :param inputs: Columns of the possible causes
+    :param targets: Columns of the targets
+    :param degeneracy: What cannot be told apart among the inputs
+    """
 
     def __init__(
         self,
         statistics: BasisMoments,
+        moments: Moments,
         expansion: BasisExpansion,
-        degeneracy: Degeneracy,
         inputs: np.ndarray,
         targets: np.ndarray,
+        degeneracy: Degeneracy,
     ) -> None:
+        self.shape = len(targets), len(inputs)
+        self.n_features = expansion.n_features
         self.degeneracy = degeneracy
-        self.expansion = expansion
-        self.n_inputs = len(inputs)
-        self.moving_target = ~statistics.raw.constant[targets]
-        self.target_scale = np.where(self.moving_target, statistics.raw.standard_deviation()[targets], 1.0)
-        self.feature_columns = self._affordable(statistics)
-        self.row_of_feature = np.full(expansion.n_features, -1)
-        self.row_of_feature[self.feature_columns] = np.arange(len(self.feature_columns))
-        self.groups = {int(i): self._rows_of(i) for i in degeneracy.kept}
+        used = _affordable_features(expansion, degeneracy.kept, moments.count)
+        self.used = np.isin(np.arange(self.n_features), used)
+        feature_deviation = np.sqrt(np.diagonal(moments.comoment)[: self.n_features] / moments.count)
+        # A feature that is not used, or does not move, has nothing in common with any other
+        moves = self.used & (feature_deviation > SMALLEST_DEVIATION)
+        self.inverse_scale = moves / np.where(moves, feature_deviation, 1.0)
+
+        deviation = statistics.raw.standard_deviation()
+        self.target_moves = ~statistics.raw.constant[targets]
+        self.target_scale = np.where(self.target_moves, deviation[targets], 1.0)
+        self.features_of = {int(i): expansion.features_of(int(i)) for i in degeneracy.kept}
         standardised = expansion.standardise(statistics.recent[:, inputs])
-        half = 0.5 * statistics.raw.standard_deviation()[inputs] / expansion.scale
-        self.differences = {int(i): self._difference(standardised, int(i), half[i]) for i in degeneracy.kept}
+        if not expansion.products:
+            # What changes with a cause is then a function of it alone: one of its ordered values can stand for its neighbours
+            standardised = np.sort(standardised, axis=0)[THINNING // 2 - 1 :: THINNING]
+        half_steps = 0.5 * deviation[inputs] / expansion.scale
+        self.differences = {i: expansion.difference(standardised, i, half_steps[i]) for i in self.features_of}
 
-    def _affordable(self, statistics: BasisMoments) -> np.ndarray:
-        """The richest features of which there are twice as many rows."""
-        kept, n_rows = self.degeneracy.kept, statistics.dynamics.total().count
-        for functions, products in ((4, True), (4, False), (2, False)):
-            columns = self.expansion.subset(kept, functions, products)
-            if n_rows >= 2 * len(columns) + 2:
-                return columns
-        return self.expansion.subset(kept, 1, False)
+        factor = self._factor(moments)
+        fit = self._fit(moments, factor)
+        # In place: another matrix of this size would be felt
+        self.groups = self._groups(th.cholesky_inverse(factor, out=factor))
+        self.whole = self._estimates(fit)
 
-    def _rows_of(self, variable: int) -> np.ndarray:
-        rows = self.row_of_feature[self.expansion.features_of(variable)]
-        return rows[rows >= 0]
+    def estimate(self, moments: Moments) -> _Estimates:
+        """
+        :param moments: Of the features and, behind them, the targets, of some of the rows
+        :return: what they say
+        """
+        return self._estimates(self._fit(moments, self._factor(moments)))
 
-    def _difference(self, standardised: np.ndarray, variable: int, half: float) -> np.ndarray:
-        """How the features of a variable differ between half a standard deviation above and below, shape (N, |G|)."""
-        above, below = standardised.copy(), standardised.copy()
-        above[:, variable] += half
-        below[:, variable] -= half
-        change = self.expansion.features(above) - self.expansion.features(below)
-        return change[:, self.feature_columns[self.groups[variable]]]
+    def _factor(self, moments: Moments) -> th.Tensor:
+        """Cholesky factor of the features' second moments S, in units of their standard deviations, shape (F, F)."""
+        gram = moments.comoment[: self.n_features, : self.n_features] * (self.inverse_scale / moments.count)
+        gram *= self.inverse_scale[:, None]
+        diagonal = np.einsum("ii->i", gram)
+        diagonal[self.inverse_scale == 0.0] = 1.0
+        diagonal += RIDGE
+        return th.linalg.cholesky(th.as_tensor(gram), out=th.as_tensor(gram))
 
-    def regress(self, moments: Moments) -> _Regression:
-        n_features = self.expansion.n_features
-        covariance = moments.covariance()
-        used = np.concatenate([self.feature_columns, np.arange(n_features, len(covariance))])
-        covariance = covariance[np.ix_(used, used)]
-        deviation = np.sqrt(np.diagonal(covariance))
-        deviation = np.where(deviation > 1e-9, deviation, np.inf)
-        n_used = len(self.feature_columns)
-        inverse_scale = 1.0 / deviation[:n_used]
-        gram = th.as_tensor(covariance[:n_used, :n_used] * np.outer(inverse_scale, inverse_scale))
-        gram.diagonal().copy_(th.full((n_used,), 1.0 + RIDGE, dtype=gram.dtype))
-        cross = th.as_tensor(covariance[:n_used, n_used:] * inverse_scale[:, None] / self.target_scale)
-        # A constant target has nothing to explain; any variance keeps its division defined
-        variance = np.where(self.moving_target, np.diagonal(covariance)[n_used:] / self.target_scale**2, 1.0)
-        inverse = th.cholesky_inverse(th.linalg.cholesky(gram))
-        coefficients = inverse @ cross
-        explained = (coefficients * cross).sum(dim=0).numpy()
-        residual = np.maximum(variance - explained, SMALLEST_RESIDUAL * variance)
-        partial = self._partial_r2(inverse, coefficients, residual, moments.count)
-        effects = self._effects(coefficients.numpy() * inverse_scale[:, None])
-        closed = ~self.moving_target
-        partial[closed], effects[closed] = 0.0, 0.0
-        r_squared = np.where(closed, 0.0, 1.0 - residual / variance)
-        return _Regression(partial, effects, r_squared)
-
-    def _partial_r2(self, inverse: th.Tensor, coefficients: th.Tensor, residual: np.ndarray, count: float) -> np.ndarray:
-        partial = np.zeros((coefficients.shape[1], self.n_inputs))
-        dependent = {member: group for group in self.degeneracy.groups for member in group}
-        alone = [i for i in self.groups if i not in dependent]
-        if alone:
-            rows = th.as_tensor(np.stack([self.groups[i] for i in alone]))
-            partial[:, alone] = self._adjusted(_explained_by(inverse, coefficients, rows), residual, rows.shape[1], count).T
+    def _groups(self, inverse: th.Tensor) -> list[_Group]:
+        in_group = {member for group in self.degeneracy.groups for member in group}
+        alone = [i for i in self.features_of if i not in in_group]
+        causes_and_features = [(alone, np.stack([self.features_of[i] for i in alone]))] if alone else []
         for group in self.degeneracy.groups:
-            members = [self.groups[i] for i in group if i in self.groups]
-            rows = th.as_tensor(np.unique(np.concatenate(members)))[None]
-            value = self._adjusted(_explained_by(inverse, coefficients, rows), residual, rows.shape[1], count)[0]
-            partial[:, list(group)] = value[:, None]
+            members = [self.features_of[i] for i in group if i in self.features_of]
+            causes_and_features.append((list(group), np.unique(np.concatenate(members))[None]))
+        groups = []
+        for causes, indices in causes_and_features:
+            features = th.as_tensor(indices)
+            spread = th.linalg.inv(inverse[features[:, :, None], features[:, None, :]])
+            groups.append(_Group(causes, features, spread))
+        return groups
+
+    def _fit(self, moments: Moments, factor: th.Tensor) -> _Fit:
+        n_features, n_used = self.n_features, int(self.used.sum())
+        cross = moments.comoment[:n_features, n_features:] * self.inverse_scale[:, None] / (moments.count * self.target_scale)
+        variance = np.diagonal(moments.comoment) / moments.count
+        deviation, variance = np.sqrt(variance[:n_features]) * self.inverse_scale, variance[n_features:] / self.target_scale**2
+        moves = self.target_moves & (variance > SMALLEST_DEVIATION**2)
+        variance = np.where(moves, variance, 1.0)
+        cross[:, ~moves] = 0.0
+        coefficients = th.cholesky_solve(th.as_tensor(cross), factor)
+        explained = (coefficients.numpy() * cross).sum(axis=0)
+        residual = np.maximum(variance - explained, SMALLEST_RESIDUAL * variance)
+        return _Fit(coefficients, deviation, variance, residual, max(moments.count - n_used - 1.0, 1.0))
+
+    def _estimates(self, fit: _Fit) -> _Estimates:
+        total_freedom = fit.freedom + int(self.used.sum())
+        r_squared = np.maximum(1.0 - (fit.residual / fit.freedom) / (fit.variance / total_freedom), 0.0)
+        return _Estimates(self._partial_r2(fit), self._effects(fit), r_squared)
+
+    def _partial_r2(self, fit: _Fit) -> np.ndarray:
+        partial = np.zeros(self.shape)
+        for causes, features, spread in self.groups:
+            of_group = fit.coefficients[features]
+            explained = (of_group * (spread @ of_group)).sum(dim=1).numpy()
+            # Variances instead of sums of squares, as in the adjusted R^2, so that a null edge has 0 on average
+            n_features = self.used[features.numpy()].sum(axis=1)[:, None]
+            ratio = (fit.residual / fit.freedom) / ((fit.residual + explained) / (fit.freedom + n_features))
+            partial[:, causes] = np.maximum(1.0 - ratio, 0.0).T
         return partial
 
-    def _adjusted(self, explained: np.ndarray, residual: np.ndarray, n_features: int, count: float) -> np.ndarray:
-        """As the adjusted R^2: variances, not sums of squares, so that a null edge has 0 on average."""
-        freedom = max(count - len(self.feature_columns) - 1.0, 1.0)
-        ratio = (residual / freedom) / ((residual + explained) / (freedom + n_features))
-        return np.maximum(1.0 - ratio, 0.0)
-
-    def _effects(self, coefficients: np.ndarray) -> np.ndarray:
-        effects = np.zeros((coefficients.shape[1], self.n_inputs))
-        for variable, difference in self.differences.items():
-            change = difference @ coefficients[self.groups[variable]]
-            effects[:, variable] = np.sign(change.mean(axis=0)) * np.abs(change).mean(axis=0)
+    def _effects(self, fit: _Fit) -> np.ndarray:
+        effects = np.zeros(self.shape)
+        coefficients = fit.coefficients.numpy() * self.inverse_scale[:, None]
+        for i, difference in self.differences.items():
+            of_cause = coefficients[self.features_of[i]]
+            change = difference @ of_cause
+            average = np.full(len(change), 1.0 / len(change))
+            # A product with the weights is several times faster than mean(axis=0)
+            effects[:, i] = np.copysign(average @ np.abs(change, out=change), (average @ difference) @ of_cause)
+        # In standard deviations of these rows: the errors of the scales and of the coefficients partly cancel
+        effects *= fit.deviation[: self.shape[1]] / np.sqrt(fit.variance)[:, None]
         for variable, (stand_in, sign) in self.degeneracy.stand_in.items():
             effects[:, variable] = sign * effects[:, stand_in]
         return effects
 
 
-def _explained_by(inverse: th.Tensor, coefficients: th.Tensor, rows: th.Tensor) -> np.ndarray:
-    """
-    ``b_G' [(S^-1)_GG]^-1 b_G`` for groups of features of one size.
-
-    :param inverse: S^-1, shape (F, F)
-    :param coefficients: b, shape (F, m)
-    :param rows: Features of each of q groups, shape (q, g)
-    :return: shape (q, m)
-    """
-    blocks = inverse[rows[:, :, None], rows[:, None, :]]
-    of_group = coefficients[rows]
-    return (of_group * th.linalg.solve(blocks, of_group)).sum(dim=1).numpy()
-
-
-def _jackknife_error(whole: np.ndarray, parts: list[np.ndarray], shares: list[float]) -> np.ndarray:
-    """Standard error by the jackknife for blocks of unequal size (Busing et al., 1999); 0 without blocks."""
-    if not parts:
-        return np.zeros_like(whole)
-    inverse_share = 1.0 / np.array(shares)
-    stacked = np.stack(parts)
-    weights = inverse_share.reshape(-1, *[1] * whole.ndim)
-    pseudo = weights * whole - (weights - 1.0) * stacked
-    estimate = len(parts) * whole - ((1.0 - 1.0 / weights) * stacked).sum(axis=0)
-    return np.sqrt(((pseudo - estimate) ** 2 / (weights - 1.0)).mean(axis=0))
+def _affordable_features(expansion: BasisExpansion, inputs: np.ndarray, n_rows: float) -> np.ndarray:
+    """The richest features of which there are twice as many rows."""
+    for functions, products in ((4, True), (4, False), (2, False)):
+        features = expansion.subset(inputs, functions, products)
+        if n_rows >= 2 * len(features) + 2:
+            return features
+    return expansion.subset(inputs, 1, False)

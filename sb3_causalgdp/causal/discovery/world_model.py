@@ -5,25 +5,23 @@ from typing import NamedTuple
 import numpy as np
 import torch as th
 
-from sb3_causalgdp.causal.degenerate import Degeneracy, find_degeneracy, variance_inflation
+from sb3_causalgdp.causal.degenerate import find_degeneracy, variance_inflation
 from sb3_causalgdp.causal.discovery.partial_r2 import edge_probability
 from sb3_causalgdp.causal.graph import CausalGraph
-from sb3_causalgdp.causal.recent_rows import RecentRows
+from sb3_causalgdp.causal.recent_rows import RecentRows, checked_rows
 from sb3_causalgdp.causal.variables import TransitionVariables
 from sb3_causalgdp.causal.world_model import MaskedWorldModel
 
 HELD_OUT = 0.1
 ROWS_AT_ONCE = 64
 MOST_TEST_ROWS = 512
-SMALLEST_RESIDUAL = 1e-6  # of the target's variance: about what float32 resolves
 
 
 class _Differences(NamedTuple):
-    """Of one target per row: mean, mean absolute and mean square difference for each cause; and the model's error."""
+    """Of one target per row: mean and mean absolute difference for each cause; and the model's error."""
 
-    mean: np.ndarray  # (n + 1, n + d), as the two below
-    absolute: np.ndarray
-    square: np.ndarray
+    mean: np.ndarray  # (n + 1, n + d)
+    absolute: np.ndarray  # (n + 1, n + d)
     residual: np.ndarray  # (n + 1,), mean square
 
 
@@ -39,19 +37,22 @@ class WorldModelEffects:
     from half a standard deviation below to half a one above, the others as they are: its size is the mean of the absolute
     difference, its sign that of the mean.
 
-    A mask is the probability ``Phi[ln(q / threshold) / spread]`` of the partial R^2 that the model implies,
-    ``q = e v / (e v + residual)``: e is the mean square of that difference, v the share of the cause's variance that the other
-    causes leave (the inverse of its variance inflation factor), and the residual is the model's mean square error on a tenth
-    of the rows that it was not trained on, in units of the target's variance. Linearly dependent causes share a mask.
+    A mask is the probability ``Phi[ln(q / threshold) / spread]`` of ``q = e^2 / (e^2 + max(residual, smallest_residual))``,
+    the share of the effect e in what the other causes leave: a partial R^2 with a cause that is moved on purpose. The residual
+    is the model's mean square error, in units of the target's variance, on a tenth of the rows that it was not trained on. It
+    is not taken below ``smallest_residual``: in a simulator without noise every effect would be many times as large as the
+    residual, and so would the error of the effects. By default the mask is one half at an effect of 0.039 standard deviations.
+    Linearly dependent causes share a mask.
 
     :param gradient_steps: Gradient steps at each refresh, at least 1
     :param first_gradient_steps: Gradient steps when there is no model to go on with, at least 1
     :param batch_size: Rows of a gradient step, at least 2
     :param learning_rate: Adam's, decays to a hundredth within a refresh, positive
-    :param net_arch: Hidden layers of the world model, all of one size; ``[256, 256]`` by default
+    :param net_arch: Hidden layers of the world model, all of one size; ``[128, 128]`` by default
     :param window: Newest rows that are kept where the caller sets no window, at least 20
-    :param threshold: Partial R^2 at which a mask is one half, in (0, 1)
-    :param spread: Uncertainty of the mask in ln(partial R^2), positive
+    :param threshold: Share q at which a mask is one half, in (0, 1)
+    :param spread: Uncertainty of the mask in ln q, positive
+    :param smallest_residual: Residual that a mask assumes at least, in units of the target's variance, positive
     :param seed: Of the weights, the batches and the held-out rows; torch's global generator is left as it is
     """
 
@@ -65,6 +66,7 @@ class WorldModelEffects:
         window: int = 20_000,
         threshold: float = 0.03,
         spread: float = 0.5,
+        smallest_residual: float = 0.05,
         seed: int = 0,
     ) -> None:
         for name, count, least in (
@@ -75,17 +77,23 @@ class WorldModelEffects:
         ):
             if not (isinstance(count, int | np.integer) and count >= least):
                 raise ValueError(f"{name} must be an integer of at least {least}, got {count!r}")
-        for name, number, most in (("learning_rate", learning_rate, np.inf), ("threshold", threshold, 1), ("spread", spread, np.inf)):
+        for name, number, most in (
+            ("learning_rate", learning_rate, np.inf),
+            ("threshold", threshold, 1),
+            ("spread", spread, np.inf),
+            ("smallest_residual", smallest_residual, np.inf),
+        ):
             if not (isinstance(number, int | float | np.number) and 0 < number < most):
                 raise ValueError(f"{name} must be a number above 0 and below {most}, got {number!r}")
         self.gradient_steps = gradient_steps
         self.first_gradient_steps = first_gradient_steps
         self.batch_size = batch_size
         self.learning_rate = learning_rate
-        self.net_arch = [256, 256] if net_arch is None else list(net_arch)
+        self.net_arch = [128, 128] if net_arch is None else list(net_arch)
         self.window = window
         self.threshold = threshold
         self.spread = spread
+        self.smallest_residual = smallest_residual
         self.seed = seed
         self.world_model: MaskedWorldModel | None = None
         """The method's own model, with all masks 1; None before the first graph."""
@@ -112,9 +120,9 @@ class WorldModelEffects:
         :param variables: Names and order of the variables
         :param previous: Not used: the model itself goes on
         :return: the graph; constant variables have no edges
-        :raises ValueError: on too few rows (10 + n + d), or when the arguments are not about the same variables
+        :raises ValueError: on fewer than n + d + 10 rows, or when the arguments are not about the same variables
         """
-        rows = checked_rows(statistics, variables, "world_model")
+        rows = checked_rows(statistics, variables, "world_model", self._needed(variables))
         generator = th.Generator().manual_seed(self.seed + self._refreshes)
         order = th.randperm(len(rows), generator=generator)
         values = th.as_tensor(rows[order.numpy()], dtype=th.float32)
@@ -149,7 +157,7 @@ class WorldModelEffects:
         if statistics is None:
             statistics = RecentRows(variables)
             statistics.update(rows)
-            checked_rows(statistics, variables, "world_model")
+            checked_rows(statistics, variables, "world_model", self._needed(variables))
         moments = statistics.moments
         deviation = np.where(moments.constant, 0.0, moments.standard_deviation())
         differences = _differences(world_model, np.asarray(rows)[:MOST_TEST_ROWS], variables, deviation)
@@ -158,32 +166,30 @@ class WorldModelEffects:
         after = np.concatenate([np.arange(variables.n_variables)[variables.next_state], inputs[variables.action]])
         correlation = moments.correlation()
         now, then = correlation[np.ix_(inputs, inputs)], correlation[np.ix_(after, after)]
-        inflation, degeneracy = variance_inflation(now), find_degeneracy(now)
-        masks = np.concatenate(
-            [
-                self._masks(differences, slice(0, n_states), _alone(now, degeneracy), degeneracy),
-                self._masks(differences, slice(n_states, None), _alone(then, find_degeneracy(then)), find_degeneracy(then)),
-            ]
-        )
+        groups = find_degeneracy(now)
+        probability = self._probability(differences)
+        masks = [groups.share(probability[:n_states]), find_degeneracy(then).share(probability[n_states:])]
         names = np.array(variables.names)
         return CausalGraph(
             variables,
-            masks,
+            np.concatenate(masks),
             np.where(differences.mean < 0.0, -1.0, 1.0) * differences.absolute,
             method="world_model",
             n_samples=statistics.n_samples,
             r_squared=np.clip(1.0 - differences.residual, 0.0, 1.0),
-            action_vif=inflation[n_states:],
+            action_vif=variance_inflation(now)[n_states:],
             constant_variables=tuple(names[moments.constant].tolist()),
-            duplicated_variables=degeneracy.names_of_groups((*variables.state_names, *variables.action_names)),
+            duplicated_variables=groups.names_of_groups((*variables.state_names, *variables.action_names)),
             found_at=datetime.now(timezone.utc).isoformat(timespec="seconds"),
         )
 
-    def _masks(self, differences: _Differences, targets: slice, share: np.ndarray, degeneracy: Degeneracy) -> np.ndarray:
-        explained = differences.square[targets] * share
-        residual = np.maximum(differences.residual[targets, None], SMALLEST_RESIDUAL)
-        partial = explained / (explained + residual)
-        return degeneracy.share(edge_probability(partial, np.zeros_like(partial), self.threshold, self.spread))
+    def _needed(self, variables: TransitionVariables) -> int:
+        return variables.n_states + variables.n_actions + 10
+
+    def _probability(self, differences: _Differences) -> np.ndarray:
+        squares = differences.absolute**2
+        share = squares / (squares + np.maximum(differences.residual, self.smallest_residual)[:, None])
+        return edge_probability(share, np.zeros_like(share), self.threshold, self.spread)
 
     def _train(self, rows: th.Tensor, variables: TransitionVariables, generator: th.Generator) -> None:
         n_steps = self.gradient_steps
@@ -207,35 +213,9 @@ class WorldModelEffects:
             schedule.step()
 
 
-def checked_rows(statistics: RecentRows, variables: TransitionVariables, method: str) -> np.ndarray:
-    """
-    :param statistics: What a method that needs rows has been given
-    :param variables: Names and order of the variables
-    :param method: Its name, for the error
-    :return: the rows that are kept
-    :raises ValueError: on fewer than n + d + 10 rows, or when the statistics are not of these rows
-    """
-    if not isinstance(statistics, RecentRows) or statistics.variables != variables:
-        raise ValueError(f"statistics must be those that make_statistics makes for {variables.names}, got {statistics!r}")
-    needed = variables.n_states + variables.n_actions + 10
-    if len(statistics) < needed:
-        raise ValueError(f"{method} needs at least {needed} rows (states + actions + 10), got {len(statistics)}")
-    return statistics.rows()
-
-
 def _columns(rows: th.Tensor, variables: TransitionVariables) -> tuple[th.Tensor, th.Tensor, th.Tensor, th.Tensor]:
-    parts = (rows[:, variables.state], rows[:, variables.action], rows[:, variables.next_state])
-    return (*(part.contiguous() for part in parts), rows[:, variables.reward].contiguous())
-
-
-def _alone(correlation: np.ndarray, degeneracy: Degeneracy) -> np.ndarray:
-    """Share of each variable's variance that the others leave, its own linear copies not counted, shape (p,)."""
-    share = np.ones(len(correlation))
-    kept = degeneracy.kept
-    share[kept] = 1.0 / variance_inflation(correlation[np.ix_(kept, kept)])
-    for variable, (stand_in, _) in degeneracy.stand_in.items():
-        share[variable] = share[stand_in]
-    return share
+    state, action, next_state = rows[:, variables.state], rows[:, variables.action], rows[:, variables.next_state]
+    return state.contiguous(), action.contiguous(), next_state.contiguous(), rows[:, variables.reward].contiguous()
 
 
 @th.no_grad()
@@ -250,10 +230,15 @@ def _differences(
     state, action, next_state, reward = _columns(th.as_tensor(rows, dtype=th.float32), variables)
     of_target = np.append(deviation[variables.next_state], deviation[variables.reward])
     inverse = np.divide(1.0, of_target, out=np.zeros_like(of_target), where=of_target > 0.0)
-    mean, absolute, square = (np.zeros((n_states + 1, n_inputs)) for _ in range(3))
+    mean, absolute = np.zeros((n_states + 1, n_inputs)), np.zeros((n_states + 1, n_inputs))
     sources = (
         (state, deviation[variables.state], lambda s, a: world_model.predict_next_state(s, a)[0], slice(0, n_states)),
-        (next_state, deviation[variables.next_state], lambda s, a: world_model.predict_reward(s, a)[0][:, None], slice(n_states, None)),
+        (
+            next_state,
+            deviation[variables.next_state],
+            lambda s, a: world_model.predict_reward(s, a)[0][:, None],
+            slice(n_states, None),
+        ),
     )
     for first, deviation_of_first, predict, targets in sources:
         half_steps = th.as_tensor(np.diag(0.5 * np.append(deviation_of_first, deviation[variables.action])), dtype=th.float32)
@@ -264,7 +249,6 @@ def _differences(
             change = (above - below).transpose(1, 2).double().numpy() * inverse[targets][:, None]
             mean[targets] += change.sum(axis=0) / len(rows)
             absolute[targets] += np.abs(change).sum(axis=0) / len(rows)
-            square[targets] += (change**2).sum(axis=0) / len(rows)
     errors = th.cat(
         [
             world_model.predict_next_state(state, action)[0] - next_state,
@@ -273,4 +257,4 @@ def _differences(
         dim=1,
     )
     residual = errors.double().square().mean(dim=0).numpy() * inverse**2
-    return _Differences(mean, absolute, square, residual)
+    return _Differences(mean, absolute, residual)

@@ -1,0 +1,353 @@
+"""From offline data to online learning, for any off-policy algorithm: preload, pretrain, and batches of both kinds."""
+
+import io
+import pathlib
+import time
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any, TypeVar
+
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback, ProgressBarCallback
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import MaybeCallback, Schedule
+from stable_baselines3.common.utils import FloatSchedule, configure_logger
+from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
+
+from sb3_causalgdp.offline.observations import flat_space
+from sb3_causalgdp.offline.preload import check_buffer, copy_rows, positions_needed, preload_buffer, spaces_of
+from sb3_causalgdp.offline.replay import SpacesEnv, can_sample
+from sb3_causalgdp.offline.rewards import RewardTransform, check_reward_transform
+from sb3_causalgdp.offline.sources import Source, open_source
+
+SelfAlgorithm = TypeVar("SelfAlgorithm", bound="OfflineToOnlineAlgorithm")
+
+
+def callback_list(callback: MaybeCallback) -> list[BaseCallback]:
+    """
+    :param callback: What ``learn()`` takes
+    :return: The callbacks in a list
+    """
+    if callback is None:
+        return []
+    if isinstance(callback, list):
+        return callback
+    return [callback if isinstance(callback, BaseCallback) else ConvertCallback(callback)]
+
+
+class OfflineToOnlineAlgorithm(OffPolicyAlgorithm):
+    """
+    An off-policy algorithm with a stage before the first step: on recorded transitions, which stay beside the new ones.
+
+    :param args: As for ``OffPolicyAlgorithm``
+    :param offline_dataset: What :meth:`preload` loads when training starts and nothing is there
+    :param pretrain_steps: Gradient steps of :meth:`pretrain` before the first step of ``learn()``
+    :param offline_fraction: Share of a batch that comes from preloaded transitions once there are others
+    :param reward_transform: What is done to the rewards once transitions were preloaded
+    :param kwargs: As for ``OffPolicyAlgorithm``
+    """
+
+    def __init__(
+        self,
+        *args,
+        offline_dataset: str | None = None,
+        pretrain_steps: int = 0,
+        offline_fraction: float | Schedule = 0.5,
+        reward_transform: str = "none",
+        **kwargs,
+    ) -> None:
+        super().__init__(*args, **kwargs)
+        self.offline_dataset = offline_dataset
+        self.pretrain_steps = pretrain_steps
+        self.offline_fraction = offline_fraction
+        self.reward_transform = reward_transform
+        # Preloaded transitions, which those of the environment never overwrite
+        self.offline_buffer: ReplayBuffer | None = None
+        self._offline_marks: list[str] = []
+        self._reward_transform: RewardTransform | None = None
+        self._n_pretrain_steps = 0
+        self._env_steps_before_pretrain: int | None = None
+
+    def _setup_model(self) -> None:
+        if self.pretrain_steps < 0:
+            raise ValueError(f"pretrain_steps must be at least 0, got {self.pretrain_steps!r}")
+        check_reward_transform(self.reward_transform)
+        self._offline_share(progress_remaining=1.0)
+        if self._env_steps_before_pretrain is not None:
+            # Saved by a callback in the middle of pretrain()
+            self.num_timesteps, self._env_steps_before_pretrain = self._env_steps_before_pretrain, None
+        super()._setup_model()
+        if self.offline_dataset is not None:
+            assert self.replay_buffer is not None
+            check_buffer(self.replay_buffer, self.reward_transform, self._vec_normalize_env)
+
+    @classmethod
+    def from_dataset(
+        cls: type[SelfAlgorithm],
+        source: Any,
+        policy: str | type[BasePolicy] = "MlpPolicy",
+        n_envs: int = 1,
+        **kwargs,
+    ) -> SelfAlgorithm:
+        """
+        A model with the spaces of a dataset and without an environment, ready for :meth:`preload` and :meth:`pretrain`. It
+        learns online after ``set_env``. Dictionaries of observations are flattened, except for a ``MultiInputPolicy``.
+
+        :param source: As for :meth:`preload`; only its spaces are read
+        :param policy: The policy model to use
+        :param n_envs: Number of environments that it will learn from
+        :param kwargs: Arguments of the constructor
+        :return: The model
+        """
+        observation_space, action_space = spaces_of(open_source(source))
+        policy_class = cls.policy_aliases.get(policy) if isinstance(policy, str) else policy
+        if not (policy_class is not None and issubclass(policy_class, cls.policy_aliases["MultiInputPolicy"])):
+            observation_space = flat_space(observation_space)
+        model = cls(policy, SpacesEnv(observation_space, action_space, n_envs), **kwargs)
+        model.env = None
+        return model
+
+    def preload(
+        self: SelfAlgorithm,
+        source: Any,
+        reward_transform: str | None = None,
+        progress_bar: bool = False,
+        download: bool = True,
+    ) -> SelfAlgorithm:
+        """
+        Load recorded transitions into ``offline_buffer``: all of them, or none when something is wrong with them. Until
+        ``learn()`` collects others, it is the replay buffer too; from then on, the environment's transitions go to a replay
+        buffer of their own, and batches are made from both (``offline_fraction``). A second call adds to the first.
+
+        Observations are flattened as the environment's ``FlattenObservation`` does, actions are scaled to [-1, 1], and a
+        training ``VecNormalize`` gets their statistics. Open your own files only: unpickling can execute code.
+
+        :param source: The id of a Minari dataset (``"D4RL/pointmaze/umaze-v2"``), a ``minari.MinariDataset``, a replay buffer
+            of SB3 or the path of a saved one, or arrays: a mapping (or the path of an ``.npz`` file) of ``observations``,
+            ``actions``, ``rewards``, ``next_observations``, ``terminations`` and ``truncations``
+        :param reward_transform: What is done to the rewards, here and in ``learn()``; None takes the constructor's
+        :param progress_bar: Whether to show a progress bar (needs tqdm)
+        :param download: Whether to download a dataset that is not on this machine
+        :return: The model
+        """
+        data = open_source(source, download)
+        name = self.reward_transform if reward_transform is None else reward_transform
+        if self._reward_transform is not None and name != self.reward_transform:
+            raise ValueError(f"The model's rewards are transformed by {self.reward_transform!r} already, got {name!r}")
+        buffer = self._buffer_with_room(data)
+        transform = name if self._reward_transform is None else self._reward_transform
+        done = preload_buffer(buffer, data, self.env, self._vec_normalize_env, transform, progress_bar)
+        if self.replay_buffer is self.offline_buffer or self._replay_buffer_is_empty():
+            self.replay_buffer = buffer
+        self.offline_buffer = buffer
+        self.reward_transform, self._reward_transform = name, done.reward_transform
+        self._offline_marks.append(done.mark)
+        return self
+
+    def _replay_buffer_is_empty(self) -> bool:
+        return self.replay_buffer is None or self.replay_buffer.size() == 0
+
+    def _buffer_with_room(self, data: Source) -> ReplayBuffer:
+        buffer = self.offline_buffer
+        if buffer is None:
+            buffer = self.replay_buffer if self._replay_buffer_is_empty() else self._new_buffer(self.n_envs)
+        assert buffer is not None
+        needed = positions_needed(buffer, data)
+        if needed <= buffer.buffer_size:
+            return buffer
+        if buffer is self.replay_buffer and buffer is not self.offline_buffer:
+            warnings.warn(
+                f"{data.name}: {data.n_transitions} transitions, which do not fit in buffer_size={self.buffer_size}. They "
+                "get a larger buffer; that of the transitions to come keeps its size"
+            )
+        larger = self._new_buffer(needed * self.n_envs)
+        copy_rows(buffer, larger)
+        return larger
+
+    def _new_buffer(self, buffer_size: int) -> ReplayBuffer:
+        assert self.replay_buffer_class is not None
+        kwargs = dict(self.replay_buffer_kwargs)
+        if issubclass(self.replay_buffer_class, HerReplayBuffer):
+            kwargs["env"] = self.env
+        return self.replay_buffer_class(
+            buffer_size,
+            self.observation_space,
+            self.action_space,
+            device=self.device,
+            n_envs=self.n_envs,
+            optimize_memory_usage=self.optimize_memory_usage,
+            **kwargs,
+        )
+
+    @property
+    def is_pretraining(self) -> bool:
+        """Whether :meth:`pretrain` is running."""
+        return self._env_steps_before_pretrain is not None
+
+    @property
+    def n_environment_steps(self) -> int:
+        """``num_timesteps``, which counts gradient steps while :meth:`pretrain` runs, without those."""
+        before = self._env_steps_before_pretrain
+        return self.num_timesteps if before is None else before
+
+    def pretrain(
+        self: SelfAlgorithm,
+        gradient_steps: int,
+        callback: MaybeCallback = None,
+        log_interval: int | None = 1_000,
+        tb_log_name: str = "offline",
+        progress_bar: bool = False,
+    ) -> SelfAlgorithm:
+        """
+        The offline stage: train everything on what was preloaded (or on the replay buffer, if nothing was), without an
+        environment. The causal masks come first, and again every ``causal_refresh_freq`` gradient steps.
+
+        Callbacks are called once after each gradient step, and may stop by returning False. While it runs, ``num_timesteps``
+        is the number of gradient steps of all calls, so that evaluations, checkpoints and logs are numbered by it; afterwards
+        it is that of environment steps again. Schedules (learning rates) go from 1 to 0 over the steps of this call; after
+        earlier calls they start where ``learn(reset_num_timesteps=False)`` would, so that an interrupted call and one with the
+        rest follow one schedule. ``learn()`` starts schedules anew; optimizers, targets and statistics go on.
+
+        :param gradient_steps: Number of gradient steps
+        :param callback: Callback(s) called after every gradient step
+        :param log_interval: Gradient steps between logs, None for none
+        :param tb_log_name: Name of the run for TensorBoard
+        :param progress_bar: Whether to show a progress bar (needs tqdm and rich)
+        :return: The model
+        """
+        if gradient_steps < 0:
+            raise ValueError(f"gradient_steps must be at least 0, got {gradient_steps!r}")
+        self._load_offline_dataset(progress_bar)
+        if self.offline_buffer is None and (self.replay_buffer is None or not can_sample(self.replay_buffer)):
+            raise ValueError("There is nothing to train on: call preload(source) or load_replay_buffer(path) first")
+        if not self._custom_logger:
+            self._logger = configure_logger(self.verbose, self.tensorboard_log, tb_log_name, self._n_pretrain_steps == 0)
+        with self._pretraining_clock(gradient_steps) as total_timesteps:
+            callback = self._init_callback([*callback_list(callback), *([_GradientStepsBar()] if progress_bar else [])])
+            callback.on_training_start(locals(), globals())
+            while self.num_timesteps < total_timesteps:
+                self.train(gradient_steps=1, batch_size=self.batch_size)
+                self.num_timesteps += 1
+                self._n_pretrain_steps += 1
+                self._update_current_progress_remaining(self.num_timesteps, total_timesteps)
+                callback.update_locals(locals())
+                if not callback.on_step():
+                    break
+                if log_interval is not None and self.num_timesteps % log_interval == 0:
+                    self._dump_pretrain_logs()
+            callback.on_training_end()
+        return self
+
+    @contextmanager
+    def _pretraining_clock(self, gradient_steps: int) -> Iterator[int]:
+        """For a while, the model's counters count the gradient steps of the offline stage."""
+        names = ("num_timesteps", "_total_timesteps", "_num_timesteps_at_start", "_current_progress_remaining", "start_time")
+        before = {name: getattr(self, name) for name in names}
+        had_env = self.env is not None
+        total_timesteps = self._n_pretrain_steps + gradient_steps
+        self._env_steps_before_pretrain = self.num_timesteps
+        self.num_timesteps = self._num_timesteps_at_start = self._n_pretrain_steps
+        self._total_timesteps, self.start_time = total_timesteps, time.time_ns()
+        self._update_current_progress_remaining(self.num_timesteps, max(1, total_timesteps))
+        if not had_env:
+            # Callbacks ask for the training environment
+            self.env = SpacesEnv(self.observation_space, self.action_space, self.n_envs)
+        try:
+            yield total_timesteps
+        finally:
+            self.__dict__.update(before)
+            self._env_steps_before_pretrain = None
+            self._steps_since_refresh = 0
+            if not had_env:
+                self.env = None
+
+    def _dump_pretrain_logs(self) -> None:
+        seconds = max((time.time_ns() - self.start_time) / 1e9, 1e-9)
+        n_steps = self.num_timesteps - self._num_timesteps_at_start
+        self.logger.record("time/gradient_steps_per_second", n_steps / seconds)
+        self.logger.record("time/time_elapsed", int(seconds), exclude="tensorboard")
+        self.logger.record("time/gradient_steps", self.num_timesteps, exclude="tensorboard")
+        self.logger.dump(step=self.num_timesteps)
+
+    def _load_offline_dataset(self, progress_bar: bool) -> None:
+        if self.offline_dataset is not None and self.offline_buffer is None and self._replay_buffer_is_empty():
+            self.preload(self.offline_dataset, progress_bar=progress_bar)
+
+    def _setup_learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        reset_num_timesteps: bool = True,
+        tb_log_name: str = "run",
+        progress_bar: bool = False,
+    ) -> tuple[int, BaseCallback]:
+        assert self.env is not None, "You must set the environment before calling learn()"
+        self._load_offline_dataset(progress_bar)
+        if self._n_pretrain_steps < self.pretrain_steps:
+            self.pretrain(self.pretrain_steps - self._n_pretrain_steps, progress_bar=progress_bar)
+        if self.offline_buffer is not None and self.offline_buffer is self.replay_buffer:
+            self.replay_buffer = self._new_buffer(self.buffer_size)
+        return super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
+
+    def _n_offline(self, batch_size: int) -> int:
+        if self.offline_buffer is None:
+            return 0
+        assert self.replay_buffer is not None
+        if self.is_pretraining or self.offline_buffer is self.replay_buffer or not can_sample(self.replay_buffer):
+            return batch_size
+        return round(batch_size * self._offline_share(self._current_progress_remaining))
+
+    def _offline_share(self, progress_remaining: float) -> float:
+        share = FloatSchedule(self.offline_fraction)(progress_remaining)
+        if not 0.0 <= share <= 1.0:
+            raise ValueError(f"offline_fraction must be between 0 and 1, got {share!r}")
+        return share
+
+    def _store_transition(self, replay_buffer, buffer_action, new_obs, reward, dones, infos) -> None:
+        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
+        if self._reward_transform is not None:
+            last = replay_buffer.pos - 1
+            replay_buffer.rewards[last] = self._reward_transform(replay_buffer.rewards[last])
+
+    def save_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase) -> None:
+        """
+        Save the replay buffer as a pickle file, and with it the preloaded transitions.
+
+        :param path: Path to the file where the replay buffer should be saved
+        """
+        assert self.replay_buffer is not None
+        self.replay_buffer.offline_part = (self.offline_buffer, self._offline_marks)  # type: ignore[attr-defined]
+        try:
+            super().save_replay_buffer(path)
+        finally:
+            del self.replay_buffer.offline_part  # type: ignore[attr-defined]
+
+    def load_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
+        """
+        Load a replay buffer from a pickle file, and the preloaded transitions that were saved with it.
+
+        :param path: Path to the pickled replay buffer
+        :param truncate_last_traj: See SB3's ``load_replay_buffer``, for ``HerReplayBuffer``
+        """
+        super().load_replay_buffer(path, truncate_last_traj)
+        assert self.replay_buffer is not None
+        self.offline_buffer, self._offline_marks = self.replay_buffer.__dict__.pop("offline_part", (None, []))
+        if self.offline_buffer is None:
+            return
+        self.offline_buffer.device = self.device
+        if isinstance(self.offline_buffer, HerReplayBuffer) and self.offline_buffer is not self.replay_buffer:
+            assert self.env is not None
+            self.offline_buffer.set_env(self.env)
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "offline_buffer", "_offline_marks"]
+
+
+class _GradientStepsBar(ProgressBarCallback):
+    """One step for each call, whatever the number of environments."""
+
+    def _on_step(self) -> bool:
+        self.pbar.update(1)
+        return True

@@ -1,0 +1,48 @@
+"""Evaluation in normalised scores."""
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from stable_baselines3.common.callbacks import EvalCallback
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_causalgdp.offline.scores import NormalizedScore, normalized_score
+
+
+class NormalizedEvalCallback(EvalCallback):
+    """
+    SB3's :class:`~stable_baselines3.common.callbacks.EvalCallback`, which also logs ``eval/normalized_score`` and keeps it as
+    ``last_normalized_score``.
+
+    The environment must give the task's own rewards: wrap it in a ``Monitor`` below wrappers that change them.
+
+    :param eval_env: The environment used for evaluation
+    :param task: Name of the task, see :func:`~sb3_causalgdp.offline.scores.normalized_score`
+    :param reference: ``"d4rl"`` or ``"minari"``
+    :param kwargs: Arguments of ``EvalCallback``
+    :raises ValueError: on an unknown task
+    """
+
+    def __init__(self, eval_env: gym.Env[Any, Any] | VecEnv, task: str, reference: str = "d4rl", **kwargs: Any) -> None:
+        normalized_score(task, 0.0, reference)  # an unknown task fails here, not after the first evaluation
+        self.task = task
+        self.reference = reference
+        self.last_normalized_score: NormalizedScore | None = None
+        super().__init__(eval_env, **kwargs)
+
+    # EvalCallback sets this between evaluating and writing the log: recorded later, the score would miss its row
+    @property
+    def last_mean_reward(self) -> float:
+        """Mean return of the last evaluation."""
+        return self._last_mean_reward
+
+    @last_mean_reward.setter
+    def last_mean_reward(self, value: float) -> None:
+        self._last_mean_reward = value
+        if np.isfinite(value):
+            # Scores are linear in returns: the mean's score is the mean score
+            self.last_normalized_score = normalized_score(self.task, value, self.reference)
+            self.logger.record("eval/normalized_score", self.last_normalized_score.mean)
+            if self.verbose >= 1:
+                print(f"Normalized score: {self.last_normalized_score}")

@@ -1,0 +1,18 @@
+"""Optional packages of the offline stage."""
+
+import importlib
+from typing import Any
+
+
+def need(module: str) -> Any:
+    """
+    Import an optional package.
+
+    :param module: Its name
+    :return: the module
+    :raises ImportError: with the command that installs it
+    """
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        raise ImportError(f'{module} cannot be imported ({error}): pip install "sb3_causalgdp[offline]"') from error

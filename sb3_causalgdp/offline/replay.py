@@ -1,0 +1,79 @@
+"""Sampling from several replay buffers, and an environment that has spaces alone."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
+
+
+def can_sample(buffer: ReplayBuffer) -> bool:
+    """
+    :param buffer: A replay buffer
+    :return: Whether it can be sampled: HER needs the end of an episode
+    """
+    if isinstance(buffer, HerReplayBuffer):
+        return bool((buffer.ep_length > 0).any())
+    # The memory efficient buffer cannot give the row that it writes next
+    return buffer.size() > int(buffer.full and buffer.optimize_memory_usage)
+
+
+def concatenate_samples(samples: Sequence[Any]) -> Any:
+    """
+    :param samples: Samples of SB3's replay buffers, all of one kind
+    :return: One sample with all rows
+    """
+    if len(samples) == 1:
+        return samples[0]
+    return type(samples[0])(*(_concatenate(parts) for parts in zip(*samples, strict=True)))
+
+
+def _concatenate(parts: Sequence[Any]) -> Any:
+    if isinstance(parts[0], dict):
+        return {key: th.cat([part[key] for part in parts]) for key in parts[0]}
+    return None if parts[0] is None else th.cat(list(parts))
+
+
+class SpacesEnv(VecEnv):
+    """
+    Stands where SB3 wants an environment and only its spaces are known; it cannot be stepped.
+
+    :param observation_space: Observation space
+    :param action_space: Action space
+    :param num_envs: Number of environments
+    """
+
+    MESSAGE = "There is no environment, only spaces: call model.set_env(env) first"
+
+    def __init__(self, observation_space: spaces.Space, action_space: spaces.Space, num_envs: int = 1) -> None:
+        self.render_mode = None
+        super().__init__(num_envs, observation_space, action_space)
+
+    def reset(self):
+        raise RuntimeError(self.MESSAGE)
+
+    def step_async(self, actions) -> None:
+        raise RuntimeError(self.MESSAGE)
+
+    def step_wait(self):
+        raise RuntimeError(self.MESSAGE)
+
+    def close(self) -> None:
+        pass
+
+    def get_attr(self, attr_name, indices=None):
+        if attr_name == "render_mode":
+            return [None] * self.num_envs
+        raise AttributeError(self.MESSAGE)
+
+    def set_attr(self, attr_name, value, indices=None) -> None:
+        raise RuntimeError(self.MESSAGE)
+
+    def env_method(self, method_name, *method_args, indices=None, **method_kwargs):
+        raise RuntimeError(self.MESSAGE)
+
+    def env_is_wrapped(self, wrapper_class, indices=None):
+        return [False] * self.num_envs

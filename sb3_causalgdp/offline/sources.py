@@ -1,0 +1,311 @@
+"""Where offline transitions come from: Minari datasets, replay buffers of SB3 and arrays, read in chunks of rows."""
+
+import os
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from zipfile import BadZipFile
+
+import numpy as np
+from gymnasium import spaces
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.save_util import load_from_pkl
+
+OFFLINE_HINT = 'pip install "sb3_causalgdp[offline]"'
+MINARI_ID = re.compile(r"(\w+://[-\w]+/)?[-\w]+(/[-\w]+)*-v\d+")
+ARRAYS = ("observations", "actions", "rewards", "next_observations", "terminations", "truncations")
+CHUNK_ROWS = 10_000
+
+
+@dataclass(frozen=True)
+class Chunk:
+    """
+    Consecutive transitions of one trajectory or of several.
+
+    :param observations: One row for each transition, in dictionaries and tuples like those of the space
+    :param next_observations: Likewise
+    :param actions: Shape ``(T, ...)``
+    :param rewards: Shape ``(T,)``
+    :param terminations: Whether the episode ended there, shape ``(T,)``
+    :param truncations: Whether it was cut there, shape ``(T,)``
+    """
+
+    observations: Any
+    next_observations: Any
+    actions: np.ndarray
+    rewards: np.ndarray
+    terminations: np.ndarray
+    truncations: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.rewards)
+
+
+class Source:
+    """
+    Offline transitions: a name, the spaces where they are known, and the rows in their order.
+
+    :param name: What to call it
+    :param n_transitions: Number of transitions
+    :param observation_space: None if it is not known
+    :param action_space: None if it is not known
+    :param environment: Name of the environment that it was collected in, None if it is not known
+    """
+
+    has_scaled_actions = False
+    """Whether actions are in [-1, 1] already, as SB3's replay buffers store them."""
+    is_in_order = True
+    """Whether a transition that does not end an episode is followed by the next one of that episode."""
+
+    def __init__(
+        self,
+        name: str,
+        n_transitions: int,
+        observation_space: spaces.Space | None = None,
+        action_space: spaces.Space | None = None,
+        environment: str | None = None,
+    ) -> None:
+        if action_space is not None and not isinstance(action_space, spaces.Box):
+            raise ValueError(f"{name} has the action space {action_space}, but continuous actions (a Box) are needed")
+        if n_transitions == 0:
+            raise ValueError(f"{name} is empty: it holds no transitions")
+        self.name = name
+        self.n_transitions = n_transitions
+        self.observation_space = observation_space
+        self.action_space = action_space
+        self.environment = environment
+
+    def chunks(self) -> Iterator[Chunk]:
+        """
+        :return: All transitions in their order, as often as one likes
+        """
+        raise NotImplementedError
+
+
+class MinariSource(Source):
+    """
+    A Minari dataset, one episode a chunk.
+
+    :param dataset: A ``minari.MinariDataset``
+    """
+
+    def __init__(self, dataset: Any) -> None:
+        environment = dataset.env_spec.name if dataset.env_spec is not None else None
+        n_transitions = int(dataset.total_steps) if len(dataset) > 0 else 0
+        super().__init__(dataset.id, n_transitions, dataset.observation_space, dataset.action_space, environment)
+        self.dataset = dataset
+
+    def chunks(self) -> Iterator[Chunk]:
+        episodes = self._episodes()
+        for number, episode in enumerate(episodes):
+            # T steps have T + 1 observations; float64 and nested like the space
+            truncations = np.array(episode.truncations, dtype=bool)
+            if len(truncations) == 0:
+                continue
+            if not (episode.terminations[-1] or truncations[-1]):
+                truncations[-1] = True  # the recording stopped there
+            lengths = {len(values) - 1 for values in _arrays_of(episode.observations)}
+            lengths |= {len(values) for values in (episode.actions, episode.rewards)}
+            if lengths != {len(truncations)}:
+                raise ValueError(
+                    f"{self.name}: episode {number} is incomplete, its arrays have lengths that do not fit together"
+                )
+            yield Chunk(
+                _rows_of(episode.observations, slice(None, -1)),
+                _rows_of(episode.observations, slice(1, None)),
+                np.asarray(episode.actions),
+                np.asarray(episode.rewards),
+                np.asarray(episode.terminations, dtype=bool),
+                truncations,
+            )
+
+    def _episodes(self) -> Iterator[Any]:
+        try:
+            yield from self.dataset.iterate_episodes()
+        except (OSError, KeyError, RuntimeError) as error:  # what h5py raises on files that are cut off or damaged
+            raise ValueError(
+                f"{self.name} cannot be read, its file is incomplete or damaged: {error}. Delete "
+                f"{self.dataset.storage.data_path} and download it again"
+            ) from error
+
+
+class BufferSource(Source):
+    """
+    A replay buffer of SB3: the trajectory of each environment, one after the other.
+
+    :param buffer: The buffer
+    :param name: What to call it
+    """
+
+    has_scaled_actions = True
+
+    def __init__(self, buffer: ReplayBuffer, name: str = "The replay buffer") -> None:
+        if buffer.optimize_memory_usage:
+            raise ValueError(
+                f"{name} was made with optimize_memory_usage=True and does not hold the last observations of its episodes: "
+                "continue it with load_replay_buffer(), or record it without that option"
+            )
+        super().__init__(name, buffer.size() * buffer.n_envs, buffer.observation_space, buffer.action_space)
+        self.buffer = buffer
+
+    def chunks(self) -> Iterator[Chunk]:
+        buffer = self.buffer
+        positions = np.arange(buffer.pos - buffer.size(), buffer.pos) % buffer.buffer_size
+        for column in range(buffer.n_envs):
+            for first in range(0, len(positions), CHUNK_ROWS):
+                rows = positions[first : first + CHUNK_ROWS]
+                dones, truncations = buffer.dones[rows, column] > 0.0, buffer.timeouts[rows, column] > 0.0
+                terminations = dones & ~truncations
+                if rows[-1] == positions[-1] and not dones[-1]:
+                    truncations[-1] = True  # the next one belongs to another environment
+                yield Chunk(
+                    _rows_of(buffer.observations, (rows, column)),
+                    _rows_of(buffer.next_observations, (rows, column)),
+                    buffer.actions[rows, column],
+                    buffer.rewards[rows, column],
+                    terminations,
+                    truncations,
+                )
+
+
+class ArraySource(Source):
+    """
+    N transitions in arrays.
+
+    :param arrays: ``observations`` and ``next_observations`` (arrays, or dictionaries of arrays), ``actions``, ``rewards``,
+        ``terminations`` and ``truncations``
+    :param name: What to call them
+    """
+
+    is_in_order = False
+
+    def __init__(self, arrays: Mapping[str, Any], name: str = "The arrays") -> None:
+        missing = [key for key in ARRAYS if key not in arrays]
+        if missing:
+            raise ValueError(f"{name} lack {missing}: {list(ARRAYS)} are needed")
+        self.arrays = {key: _as_arrays(arrays[key]) for key in ARRAYS}
+        lengths = {key: [len(values) if values.ndim else 0 for values in _arrays_of(self.arrays[key])] for key in ARRAYS}
+        if len({length for given in lengths.values() for length in given}) != 1:
+            raise ValueError(f"{name} must have one row for each transition, got lengths {lengths}")
+        if not np.issubdtype(self.arrays["actions"].dtype, np.floating):
+            raise ValueError(f"{name} have actions of {self.arrays['actions'].dtype}, but continuous actions are needed")
+        super().__init__(name, len(self.arrays["actions"]))
+
+    def chunks(self) -> Iterator[Chunk]:
+        for first in range(0, self.n_transitions, CHUNK_ROWS):
+            rows = slice(first, first + CHUNK_ROWS)
+            observations, actions, rewards, next_observations, terminations, truncations = (
+                _rows_of(self.arrays[key], rows) for key in ARRAYS
+            )
+            yield Chunk(
+                observations,
+                next_observations,
+                actions,
+                rewards.reshape(-1),
+                terminations.reshape(-1).astype(bool),
+                truncations.reshape(-1).astype(bool),
+            )
+
+
+def open_source(source: Any, download: bool = True) -> Source:
+    """
+    Unpickling a replay buffer can execute code: open your own files only.
+
+    :param source: The id of a Minari dataset, a ``minari.MinariDataset``, a replay buffer of SB3 or the path of a saved one
+        (``.pkl``), or arrays: a mapping or the path of what ``numpy.savez`` wrote (``.npz``)
+    :param download: Whether to download a Minari dataset that is not on this machine
+    :return: The source, of which no row has been read
+    :raises FileNotFoundError: If there is no such file or dataset
+    :raises ValueError: If it cannot be used
+    :raises ImportError: If it needs a package that is not installed
+    """
+    if isinstance(source, Source):
+        return source
+    if isinstance(source, ReplayBuffer):
+        return BufferSource(source)
+    if isinstance(source, Mapping):
+        return ArraySource(source)
+    if isinstance(source, str | os.PathLike):
+        return _open_name(os.fspath(source), download)
+    if hasattr(source, "iterate_episodes"):
+        return MinariSource(source)
+    raise TypeError(
+        "A source is the id of a Minari dataset, a MinariDataset, a replay buffer, a path or a mapping of arrays, "
+        f"got {type(source).__name__}"
+    )
+
+
+def _open_name(name: str, download: bool) -> Source:
+    path = Path(name)
+    if not path.is_file() and Path(f"{name}.pkl").is_file():
+        path = Path(f"{name}.pkl")  # save_replay_buffer adds the suffix, too
+    if path.suffix == ".npz" and path.is_file():
+        return _open_arrays(path)
+    if path.is_file():
+        return _open_buffer(path)
+    if path.suffix in (".pkl", ".npz") or not MINARI_ID.fullmatch(name):
+        raise FileNotFoundError(f"There is no file {name!r}, and the id of a Minari dataset ends in -v and a number")
+    return _open_minari(name, download)
+
+
+def _open_arrays(path: Path) -> Source:
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = {key: file[key] for key in ARRAYS if key in file}
+    except (BadZipFile, EOFError, OSError, TypeError, ValueError) as error:
+        raise ValueError(f"{path} cannot be read as arrays: {error}") from error
+    return ArraySource(arrays, str(path))
+
+
+def _open_buffer(path: Path) -> Source:
+    try:
+        buffer = load_from_pkl(path)
+    except Exception as error:  # a broken pickle can raise anything
+        raise ValueError(f"{path} cannot be read as a replay buffer: {type(error).__name__}: {error}") from error
+    if not isinstance(buffer, ReplayBuffer):
+        raise ValueError(f"{path} holds no replay buffer of SB3 but a {type(buffer).__name__}")
+    return BufferSource(buffer, str(path))
+
+
+def _open_minari(dataset_id: str, download: bool) -> Source:
+    try:
+        import minari
+    except ImportError as error:
+        raise ImportError(f"The Minari dataset {dataset_id!r} needs the package minari: {OFFLINE_HINT}") from error
+    try:
+        dataset = minari.load_dataset(dataset_id, download=download)
+    except FileNotFoundError as error:
+        raise FileNotFoundError(f"The Minari dataset {dataset_id!r} is not on this machine: {error}") from error
+    except ImportError as error:
+        raise ImportError(f"The Minari dataset {dataset_id!r} needs another package ({error}): {OFFLINE_HINT}") from error
+    except Exception as error:  # of the network, of a server's library, or of a broken file
+        raise ValueError(
+            f"The Minari dataset {dataset_id!r} is not on this machine and cannot be downloaded, or its metadata are "
+            f"damaged: {type(error).__name__}: {error}"
+        ) from error
+    return MinariSource(dataset)
+
+
+def _as_arrays(values: Any) -> Any:
+    if isinstance(values, Mapping):
+        return {key: _as_arrays(part) for key, part in values.items()}
+    return np.asarray(values)
+
+
+def _arrays_of(tree: Any) -> Iterator[np.ndarray]:
+    """The arrays in dictionaries and tuples."""
+    if isinstance(tree, Mapping | tuple):
+        for part in tree.values() if isinstance(tree, Mapping) else tree:
+            yield from _arrays_of(part)
+    else:
+        yield np.asarray(tree)
+
+
+def _rows_of(tree: Any, rows: Any) -> Any:
+    if isinstance(tree, Mapping):
+        return {key: _rows_of(part, rows) for key, part in tree.items()}
+    if isinstance(tree, tuple):
+        return tuple(_rows_of(part, rows) for part in tree)
+    return tree[rows]

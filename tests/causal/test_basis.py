@@ -1,0 +1,232 @@
+import pickle
+import tracemalloc
+
+import numpy as np
+import pytest
+
+from sb3_causalgdp.causal import TransitionVariables
+from sb3_causalgdp.causal.basis import BasisExpansion, BasisMoments
+from sb3_causalgdp.causal.discovery import PartialR2
+
+VARIABLES = TransitionVariables(("x", "y"), ("force",))
+
+
+def draw(n_rows, seed=0, scale=1.0, variables=VARIABLES):
+    rng = np.random.default_rng(seed)
+    n, d = variables.n_states, variables.n_actions
+    states, actions = scale * rng.standard_normal((n_rows, n)), rng.uniform(-1.0, 1.0, (n_rows, d))
+    next_states = states + scale * actions[:, :1] + 0.1 * scale * rng.standard_normal((n_rows, n))
+    return variables.stack(states, actions, next_states, next_states[:, 0] - actions[:, 0] ** 2)
+
+
+def fed(rows, batch=100, **kwargs):
+    statistics = BasisMoments(VARIABLES, **kwargs)
+    for start in range(0, len(rows), batch):
+        statistics.update(rows[start : start + batch])
+    return statistics
+
+
+def expand(z, products=True):
+    """The formula, column by column."""
+    b = np.clip(z, -5.0, 5.0)
+    columns = [*z.T, *(b**2).T, *np.sin(b).T, *np.tanh(b).T]
+    p = z.shape[1]
+    columns += [b[:, i] * b[:, j] for i in range(p) for j in range(i + 1, p)] if products else []
+    return np.stack(columns, axis=1)
+
+
+@pytest.fixture
+def expansion():
+    return BasisExpansion(np.array([1.0, -2.0, 0.5]), np.array([2.0, 0.5, 1.0]), products=True)
+
+
+@pytest.mark.parametrize("products", [True, False])
+def test_features_follow_the_formula(expansion, products):
+    expansion = BasisExpansion(expansion.location, expansion.scale, products)
+    inputs = 8.0 * np.random.default_rng(0).standard_normal((50, 3))
+    z = (inputs - [1.0, -2.0, 0.5]) / [2.0, 0.5, 1.0]
+    features = expansion.features(expansion.standardise(inputs))
+    np.testing.assert_allclose(features, expand(z, products))
+    assert np.abs(z).max() > 5.0 and features.shape == (50, expansion.n_features)
+
+
+def test_features_of_a_variable_are_those_that_change_with_it(expansion):
+    z = np.random.default_rng(0).standard_normal((20, 3))
+    for variable in range(3):
+        moved = z.copy()
+        moved[:, variable] += 0.3
+        changed = (expansion.features(moved) != expansion.features(z)).any(axis=0)
+        np.testing.assert_array_equal(np.flatnonzero(changed), np.sort(expansion.features_of(variable)))
+
+
+@pytest.mark.parametrize("products", [True, False])
+def test_difference_is_that_of_the_features(expansion, products):
+    expansion = BasisExpansion(expansion.location, expansion.scale, products)
+    z = 3.0 * np.random.default_rng(0).standard_normal((20, 3))
+    for variable in range(3):
+        above, below = z.copy(), z.copy()
+        above[:, variable] += 0.4
+        below[:, variable] -= 0.4
+        expected = (expansion.features(above) - expansion.features(below))[:, expansion.features_of(variable)]
+        np.testing.assert_allclose(expansion.difference(z, variable, 0.4), expected, atol=1e-12)
+
+
+def test_subset_has_the_features_of_the_kept_inputs_alone(expansion):
+    z = np.random.default_rng(0).standard_normal((20, 3))
+    kept = np.array([0, 2])
+    features = expansion.features(z)
+    np.testing.assert_allclose(features[:, expansion.subset(kept, 4, True)], expand(z[:, kept]))
+    np.testing.assert_allclose(features[:, expansion.subset(kept, 4, False)], expand(z[:, kept], products=False))
+    np.testing.assert_allclose(features[:, expansion.subset(kept, 2, False)], np.hstack([z[:, kept], z[:, kept] ** 2]))
+    np.testing.assert_allclose(features[:, expansion.subset(kept, 1, False)], z[:, kept])
+
+
+@pytest.mark.parametrize("batch", [1, 37, 1000])
+def test_moments_are_those_of_features_and_targets(batch):
+    rows = draw(600)
+    statistics = fed(rows, batch)
+    # The first batches up to 200 rows decide
+    first = rows[: batch * -(-200 // batch)]
+    for moments, inputs, target in (
+        (statistics.dynamics, [0, 1, 2], [3, 4]),
+        (statistics.reward, [3, 4, 2], [5]),
+    ):
+        z = (rows - first.mean(axis=0))[:, inputs] / first.std(axis=0)[inputs]
+        everything = np.hstack([expand(z), rows[:, target]])
+        np.testing.assert_allclose(moments.mean, everything.mean(axis=0), atol=1e-9)
+        np.testing.assert_allclose(moments.covariance(), np.cov(everything.T, ddof=0), atol=1e-9)
+        assert moments.n_samples == 600
+    np.testing.assert_array_equal(statistics.recent, rows[-256:])
+
+
+def test_the_first_rows_fix_the_scale():
+    statistics = fed(draw(200))
+    known = statistics.expansions
+    statistics.update(draw(5000, seed=1, scale=1.5))
+    assert statistics.expansions is known and not statistics.wants_history
+
+
+def test_a_start_with_few_rows_uses_all_of_them():
+    rows = draw(50)
+    statistics = fed(rows, batch=10)
+    assert statistics.expansions is None and statistics.dynamics.n_samples == 0
+    statistics.start()
+    np.testing.assert_allclose(statistics.expansions[0].location, rows[:, :3].mean(axis=0))
+    statistics.update(draw(30, seed=1))
+    assert statistics.dynamics.n_samples == statistics.reward.n_samples == statistics.n_samples == 80
+
+
+def test_an_input_that_moved_starts_the_features_anew_and_asks_for_history():
+    early, late = draw(400), draw(1200, seed=1, scale=8.0)
+    statistics = fed(early)
+    before = statistics.expansions
+    statistics.update(late)
+    assert statistics.wants_history and statistics.expansions is not before
+    assert statistics.dynamics.n_samples == statistics.reward.n_samples == 1200
+    assert statistics.n_samples == 1600
+
+
+def test_refilling_gives_the_graph_of_feeding_afresh_on_the_new_scale():
+    rows = np.concatenate([draw(400), draw(1200, seed=1, scale=8.0)])
+    statistics = fed(rows)
+    assert statistics.wants_history
+    statistics.restart()
+    for start in range(0, 1600, 100):
+        statistics.refill(rows[start : start + 100])
+    assert not statistics.wants_history
+    afresh = BasisMoments(VARIABLES)
+    afresh.update(rows)  # in one batch: its scale is that of all rows
+    method = PartialR2()
+    one, other = method(statistics, VARIABLES), method(afresh, VARIABLES)
+    for name in ("masks", "effects", "standard_errors", "r_squared"):
+        np.testing.assert_allclose(getattr(one, name), getattr(other, name), atol=1e-6)
+    assert one.n_samples == other.n_samples == 1600
+
+
+def test_an_input_that_begins_to_move_gets_a_scale():
+    rows = draw(1500)
+    rows[:300, [1, 4]] = 0.25
+    statistics = fed(rows[:300])
+    assert statistics.expansions[0].scale[1] == 1.0
+    rows[300:, [1, 4]] *= 1e-3
+    statistics.update(rows[300:])
+    assert statistics.wants_history
+    assert 1e-4 < statistics.expansions[0].scale[1] < 0.5
+
+
+def test_a_large_batch_fades_as_small_ones_do():
+    rows = draw(4096)
+    large, small = (fed(rows, batch, half_life=1000.0) for batch in (4096, 512))
+    for part in ("raw", "dynamics", "reward"):
+        assert getattr(large, part).count == pytest.approx(getattr(small, part).count)
+        assert getattr(large, part).count < 2000.0
+
+
+def test_a_window_forgets_features_and_rows():
+    rows = draw(2000)
+    statistics = fed(rows, window=400)
+    assert statistics.raw.count <= 400 and statistics.dynamics.count <= 400 and statistics.reward.count <= 400
+
+
+def test_a_bad_row_is_named_and_changes_nothing():
+    for n_rows in (100, 300):
+        statistics = fed(draw(n_rows))
+        before, rows = pickle.dumps(statistics), draw(3000)
+        rows[2500, 4] = np.nan
+        with pytest.raises(ValueError, match=r"first bad row 2500, bad variables \[\"y'\"\]"):
+            statistics.update(rows)
+        assert pickle.dumps(statistics) == before
+    with pytest.raises(ValueError, match=r"rows must have shape \(N, 6\)"):
+        statistics.update(np.zeros((3, 5)))
+
+
+def test_the_arrays_of_the_caller_are_neither_changed_nor_kept():
+    rows = draw(150)
+    statistics, kept = BasisMoments(VARIABLES), rows.copy()
+    statistics.update(rows)
+    np.testing.assert_array_equal(rows, kept)
+    rows[:] = 1e6  # as one who fills the same array again
+    statistics.update(draw(100, seed=1))
+    expected = fed(np.concatenate([kept, draw(100, seed=1)]), batch=150)
+    np.testing.assert_array_equal(statistics.dynamics.mean, expected.dynamics.mean)
+    assert statistics.recent.max() < 100.0
+
+
+def test_pickle_keeps_what_was_fed():
+    for n_rows in (100, 400):
+        statistics = fed(draw(n_rows))
+        loaded = pickle.loads(pickle.dumps(statistics))
+        for each in (statistics, loaded):
+            each.update(draw(300, seed=1))
+        assert PartialR2()(loaded, VARIABLES).masks.tolist() == PartialR2()(statistics, VARIABLES).masks.tolist()
+
+
+@pytest.mark.parametrize(("n_inputs", "products"), [(60, True), (61, False)])
+def test_there_are_products_up_to_sixty_inputs(n_inputs, products):
+    variables = TransitionVariables(tuple(f"s{i}" for i in range(n_inputs - 2)), ("a", "b"))
+    statistics = BasisMoments(variables)
+    assert statistics.products is products
+    n_features = 4 * n_inputs + (n_inputs * (n_inputs - 1) // 2 if products else 0)
+    assert statistics.dynamics.n_variables == n_features + n_inputs - 2
+    assert BasisMoments(variables, products=not products, max_memory=1e9).products is not products
+
+
+def test_the_memory_limit_takes_blocks_away_and_then_is_an_error():
+    # 15 features, 17 and 16 columns: 4360 bytes a block
+    assert [BasisMoments(VARIABLES, max_memory=size).dynamics.n_blocks for size in (8 * 4360, 7 * 4360, 2 * 4360)] == [8, 6, 2]
+    with pytest.raises(ValueError, match=r"15 features of 3 states and actions .* use products=False"):
+        BasisMoments(VARIABLES, max_memory=2 * 4360 - 1)
+    with pytest.raises(ValueError, match="more memory"):
+        BasisMoments(VARIABLES, products=False, max_memory=1000)
+
+
+def test_a_long_batch_needs_little_memory_beside_itself():
+    variables = TransitionVariables(tuple(f"s{i}" for i in range(20)), ("a", "b"))
+    rows = draw(20_000, variables=variables)
+    statistics = BasisMoments(variables)
+    tracemalloc.start()
+    statistics.update(rows)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    # The features of all rows would be 50 MB
+    assert peak < 0.5 * 20_000 * (4 * 22 + 22 * 21 // 2) * 8

@@ -1,0 +1,466 @@
+import sys
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sb3_causalgdp.causal import StreamingMoments, TransitionVariables, make_discovery
+from sb3_causalgdp.causal.basis import BasisMoments
+from sb3_causalgdp.causal.discovery import DISCOVERY_METHODS, PartialR2, discover, make_statistics
+from sb3_causalgdp.causal.discovery import partial_r2 as module
+from sb3_causalgdp.causal.discovery.partial_r2 import edge_probability
+
+# The benchmarks are not part of the installed package
+sys.path.append(str(Path(__file__).parents[2]))
+
+from benchmarks.discovery.metrics import auroc, ece, f1
+from benchmarks.discovery.systems import KINDS, make_system
+
+VARIABLES = TransitionVariables(("x", "y", "z"), ("push", "pull"))
+NO_SPREAD = 1e-9  # masks are 0 or 1, but for the error of the sample
+
+
+def rows_of(n_rows, seed=0, noise=0.3, variables=VARIABLES):
+    """x' = .8 x + .5 push, y' = sin(2 x), z' = .9 z; r = x' - push^2; with noise."""
+    rng = np.random.default_rng(seed)
+    states, actions = rng.standard_normal((n_rows, 3)), rng.uniform(-1.0, 1.0, (n_rows, 2))
+    x, _, z = states.T
+    next_states = np.stack([0.8 * x + 0.5 * actions[:, 0], np.sin(2.0 * x), 0.9 * z], axis=1)
+    next_states += noise * rng.standard_normal((n_rows, 3))
+    rewards = next_states[:, 0] - actions[:, 0] ** 2 + noise * rng.standard_normal(n_rows)
+    return variables.stack(states, actions, next_states, rewards)
+
+
+def statistics_of(rows, method, variables=VARIABLES, **kwargs):
+    statistics = make_statistics(method, variables, **kwargs)
+    statistics.update(rows)
+    return statistics
+
+
+def graph_of(rows, variables=VARIABLES, method=None, **kwargs):
+    method = PartialR2(**kwargs) if method is None else method
+    return method(statistics_of(rows, method, variables), variables)
+
+
+# What it computes --------------------------------------------------------------------------------------------------------
+
+
+def residual_by_refit(features, target):
+    design = np.column_stack([np.ones(len(features)), features])
+    return ((target - design @ np.linalg.lstsq(design, target, rcond=None)[0]) ** 2).sum()
+
+
+@pytest.mark.parametrize("products", [True, False])
+@pytest.mark.parametrize("equation", ["dynamics", "reward"])
+def test_leaving_out_a_cause_equals_an_actual_refit(monkeypatch, equation, products):
+    """The partial R^2 of every edge, and R^2, from least squares on the rows with and without the cause's features."""
+    rows, method = rows_of(400), PartialR2(products=products)
+    statistics, kept = statistics_of(rows, method), []
+    monkeypatch.setattr(module, "edge_probability", lambda partial, *_: kept.append(partial) or np.zeros_like(partial))
+    graph = method(statistics, VARIABLES)
+    which = ("dynamics", "reward").index(equation)
+    expansion = statistics.expansions[which]
+    inputs = (statistics.inputs_of_dynamics, statistics.inputs_of_reward)[which]
+    targets, r_squared = ((rows[:, 5:8], graph.r_squared[:3]), (rows[:, [8]], graph.r_squared[3:]))[which]
+    features = expansion.features(expansion.standardise(rows[:, inputs]))
+    n_rows, n_features = features.shape
+    for j, target in enumerate(targets.T):
+        residual = residual_by_refit(features, target)
+        variance = ((target - target.mean()) ** 2).sum()
+        freedom = n_rows - n_features - 1
+        assert r_squared[j] == pytest.approx(max(0.0, 1 - (residual / freedom) / (variance / (n_rows - 1))), abs=1e-6)
+        for i in range(5):
+            out = expansion.features_of(i)
+            without = residual_by_refit(np.delete(features, out, axis=1), target)
+            adjusted = 1 - (residual / freedom) / (without / (freedom + len(out)))
+            assert kept[which][j, i] == pytest.approx(max(0.0, adjusted), abs=1e-6)
+
+
+def test_effects_of_a_linear_system_are_its_standardised_coefficients():
+    rng = np.random.default_rng(0)
+    states, actions = rng.standard_normal((3000, 3)) * [1.0, 5.0, 0.1], rng.uniform(-1.0, 1.0, (3000, 2))
+    slopes = np.array([[0.5, 0.1, 0.0, -0.6, 0.0], [0.0, 0.9, 0.0, 0.0, 1.0], [0.02, 0.0, -0.7, 0.0, 0.0]])
+    next_states = np.hstack([states, actions]) @ slopes.T
+    next_states += 0.1 * next_states.std(axis=0) * rng.standard_normal((3000, 3))
+    rewards = next_states @ [1.0, -0.2, 0.0] + 0.3 * actions[:, 1] + 0.1 * rng.standard_normal(3000)
+    graph = graph_of(VARIABLES.stack(states, actions, next_states, rewards))
+    expected = slopes * np.hstack([states, actions]).std(axis=0) / next_states.std(axis=0)[:, None]
+    np.testing.assert_allclose(graph.effects[:3], expected, atol=0.03)
+    of_reward = np.array([1.0, -0.2, 0.0, 0.0, 0.3]) * np.hstack([next_states, actions]).std(axis=0) / rewards.std()
+    np.testing.assert_allclose(graph.effects[3], of_reward, atol=0.03)
+    opened = np.vstack([slopes, of_reward]) != 0.0
+    assert (graph.masks[opened] > 0.5).all() and (graph.masks[~opened] < 0.1).all()
+
+
+def test_an_even_function_has_an_edge_and_an_effect_where_notears_sees_nothing():
+    rows = rows_of(3000)
+    graph, linear = graph_of(rows), discover("notears", rows, VARIABLES)
+    assert graph.action_to_reward[0] > 0.99 and graph.action_to_reward[1] < 0.01
+    assert abs(graph.effect_action_to_reward[0]) > 0.05 > abs(graph.effect_action_to_reward[1])
+    assert linear.action_to_reward[0] == 0.0
+
+
+def test_effects_without_products_need_few_of_the_newest_rows(monkeypatch):
+    rows = rows_of(1000)
+    graph = graph_of(rows, products=False)
+    monkeypatch.setattr(module, "THINNING", 2)
+    np.testing.assert_allclose(graph.effects, graph_of(rows, products=False).effects, atol=0.02)
+
+
+def test_a_cause_in_a_product_alone_is_found():
+    rng = np.random.default_rng(0)
+    rows = rows_of(2000)
+    rows[:, 7] = rows[:, 1] * rows[:, 4] + 0.3 * rng.standard_normal(2000)
+    assert graph_of(rows).masks[2].round(2).tolist() == [0.0, 1.0, 0.0, 0.0, 1.0]
+    assert graph_of(rows, products=False).masks[2].max() < 0.5
+
+
+@pytest.mark.parametrize("noise", [0.1, 0.3, 1.0])
+def test_r_squared_is_the_share_that_the_causes_explain(noise):
+    graph = graph_of(rows_of(4000, noise=noise))
+    signal = np.array([0.8**2 + 0.5**2 / 3.0, 0.5 * (1.0 - np.exp(-8.0)), 0.9**2])
+    np.testing.assert_allclose(graph.r_squared[:3], signal / (signal + noise**2), atol=0.03)
+
+
+def test_r_squared_of_noise_is_not_that_of_the_number_of_features():
+    rows = np.random.default_rng(0).standard_normal((100, 9))
+    assert graph_of(rows).r_squared.max() < 0.25  # 20 to 30 features would explain as many percent
+
+
+# How well it finds graphs -----------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def found():
+    """For each kind of system, the masks and the truth where data can decide."""
+    result = {}
+    for kind in KINDS:
+        rng = np.random.default_rng(0)
+        system = make_system(kind, rng, n_states=6, n_actions=2)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            graph = graph_of(system.sample(2000, rng), system.variables)
+        result[kind] = system.fold_copies(graph.masks)[system.scored], system.adjacency[system.scored]
+    return result
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_graphs_of_known_systems_are_found(found, kind):
+    assert auroc(*found[kind]) >= 0.99
+    assert f1(*found[kind]) >= 0.9
+
+
+def test_masks_are_calibrated_near_zero_and_one(found):
+    masks, truth = (np.concatenate(parts) for parts in zip(*found.values(), strict=True))
+    assert truth[masks > 0.9].mean() > 0.95
+    assert truth[masks < 0.1].mean() < 0.05
+    assert ece(masks, truth) < 0.06
+
+
+def test_noise_has_no_edges():
+    rows = np.random.default_rng(0).standard_normal((1000, 9))
+    assert graph_of(rows).masks.max() < 0.2
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("step", [0.05, 0.002])
+def test_exact_dynamics_have_no_false_edges_from_rounding(dtype, step):
+    """As a replay buffer holds them: v' = .95 v + dt a, x' = x + dt v, w stays beside; the reward is x' - a^2."""
+    rng = np.random.default_rng(0)
+    variables = TransitionVariables(("x", "v", "w"), ("push",))
+    states, actions = rng.standard_normal((3000, 3)) * [1.0, 1.0, 3.0], rng.uniform(-1.0, 1.0, (3000, 1))
+    states, actions = states.astype(dtype), actions.astype(dtype)
+    x, v, w = states.T
+    next_states = np.stack([x + step * v, 0.95 * v + step * actions[:, 0], 0.5 * w + 2.0], axis=1).astype(dtype)
+    rewards = (next_states[:, 0] - actions[:, 0] ** 2).astype(dtype)
+    masks = graph_of(variables.stack(states, actions, next_states, rewards), variables).masks
+    expected = np.array([[1, 1, 0, 0], [0, 1, 0, 1], [0, 0, 1, 0], [1, 0, 0, 1]])
+    np.testing.assert_allclose(masks, expected, atol=1e-3)
+
+
+# Standard errors and what a mask is made of ------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def samples():
+    """Effects and their errors, ln partial R^2 and its errors: each of shape (30 samples, 3, 5)."""
+    values = []
+
+    def keep(partial, log_error, *args):
+        values[-1] += [np.log(np.maximum(partial[:3], 1e-12)), log_error[:3]]
+        return edge_probability(partial, log_error, *args)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(module, "edge_probability", keep)
+        for seed in range(30):
+            values.append([])
+            graph = graph_of(rows_of(600, seed, noise=0.3), products=False)
+            values[-1] = [graph.effects[:3], graph.standard_errors[:3], *values[-1][:2]]
+    return [np.stack(parts) for parts in zip(*values, strict=True)]
+
+
+@pytest.mark.parametrize("what", ["effects", "logarithms"])
+def test_standard_errors_are_the_spread_over_samples(samples, what):
+    estimates, errors = samples[:2] if what == "effects" else samples[2:]
+    for edge in ((0, 0), (0, 3), (1, 0), (2, 2)):
+        spread = estimates[(slice(None), *edge)].std(ddof=1)
+        assert 0.5 < errors[(slice(None), *edge)].mean() / spread < 2.0, edge
+
+
+def test_a_mask_is_the_probability_that_the_share_is_over_the_threshold():
+    share = np.array([0.0, 1e-9, 0.01, 0.03, 0.09, 1.0])
+    masks = edge_probability(share, np.zeros(6), threshold=0.03, spread=0.5)
+    np.testing.assert_allclose(masks, [0.0, 0.0, 0.0140, 0.5, 0.9860, 1.0], atol=1e-4)
+    assert masks[0] == masks[1] == 0.0
+    unsure = edge_probability(share, np.full(6, 2.0), threshold=0.03, spread=0.5)
+    assert masks[2] < unsure[2] < 0.5 == unsure[3] < unsure[4] < masks[4]
+
+
+def test_an_unsure_edge_has_a_mask_further_from_zero_and_one(monkeypatch):
+    rows = rows_of(150, noise=1.0)
+    with_errors = graph_of(rows, spread=0.1)
+    monkeypatch.setattr(module, "jackknife_error", lambda whole, *_: np.zeros_like(whole))
+    without = graph_of(rows, spread=0.1)
+    sure = (without.masks > 0.99) | ((without.masks > 0.0) & (without.masks < 0.01))
+    unsure = (with_errors.masks > 0.02) & (with_errors.masks < 0.98)
+    assert (sure & unsure).any()
+
+
+def test_few_rows_open_no_edges_by_their_number_of_features():
+    """Unadjusted, a null edge of 8 of 35 features would have a share of some 8 / 70."""
+    rows = np.random.default_rng(0).standard_normal((80, 9))
+    assert graph_of(rows, spread=NO_SPREAD).masks.mean() < 0.4
+    shares = []
+    for seed in range(10):
+        rows = np.random.default_rng(seed).standard_normal((80, 9))
+        shares.append(graph_of(rows, threshold=0.1, spread=NO_SPREAD).masks.mean())
+    assert np.mean(shares) < 0.25
+
+
+@pytest.mark.parametrize("n_rows", [14, 30, 60, 90])
+def test_few_rows_use_fewer_features(n_rows):
+    graph = graph_of(rows_of(n_rows, noise=0.02))
+    assert graph.masks[0, 0] > 0.5 and graph.masks[2, 2] > 0.5
+    assert graph.n_samples == n_rows
+
+
+# What cannot be told apart ----------------------------------------------------------------------------------------------
+
+
+def with_copy(n_rows=2000, factor=-2.0):
+    """z is a copy of x; and so is z' of x'."""
+    rows = rows_of(n_rows)
+    rows[:, 2], rows[:, 7] = factor * rows[:, 0], factor * rows[:, 5]
+    return rows
+
+
+def test_copies_share_a_mask_and_are_listed():
+    graph, alone = graph_of(with_copy()), graph_of(rows_of(2000))
+    assert graph.duplicated_variables == (("x", "z"),)
+    np.testing.assert_array_equal(graph.masks[:, 0], graph.masks[:, 2])
+    # Tested together they lose nothing, where one by one neither would explain anything
+    np.testing.assert_allclose(graph.masks[:2, :2], alone.masks[:2, :2], atol=0.02)
+    assert graph.masks[0, 0] > 0.99 and graph.state_to_reward[0] > 0.99
+    np.testing.assert_allclose(graph.effects[:, 2], -graph.effects[:, 0])
+    np.testing.assert_allclose(graph.effects[:2, 0], alone.effects[:2, 0], atol=0.02)
+
+
+def test_a_sum_is_tested_together_with_its_terms():
+    rows = rows_of(2000)
+    rows[:, 2] = rows[:, 0] + rows[:, 1]
+    rows[:, 7] = rows[:, 1] + 0.3 * np.random.default_rng(1).standard_normal(2000)
+    graph = graph_of(rows)
+    assert graph.duplicated_variables == (("x", "y", "z"),)
+    # x causes x', y causes z': which of the three are kept for the regression must not matter
+    assert (graph.masks[[0, 2], :3] > 0.99).all()
+    assert (graph.masks[:, :3].T[:, :3] == graph.masks[:3, 0]).all()
+    assert graph.masks[0, 3] > 0.99 > 0.1 > graph.masks[0, 4]
+
+
+def test_an_action_that_the_next_state_repeats_is_listed_with_it():
+    rows = rows_of(2000)
+    rows[:, 7] = rows[:, 3]
+    graph = graph_of(rows)
+    assert graph.duplicated_variables == (("z'", "push"),)
+    assert graph.state_to_reward[2] == graph.action_to_reward[0] > 0.99
+    assert graph.action_to_state[2, 0] > 0.99
+
+
+def test_constants_have_no_edges():
+    rows = rows_of(2000)
+    rows[:, [2, 7]] = 0.1
+    rows[:, 4] = -1.0
+    graph = graph_of(rows)
+    assert graph.constant_variables == ("z", "pull", "z'")
+    for values in (graph.masks, graph.effects, graph.standard_errors):
+        assert not values[:, [2, 4]].any() and not values[2].any()
+    assert graph.r_squared[2] == 0.0 and graph.masks[0, 0] > 0.99
+
+
+def test_a_constant_reward_has_no_causes():
+    rows = rows_of(500)
+    rows[:, 8] = 0.0
+    graph = graph_of(rows, on_degenerate="raise")
+    assert not graph.masks[3].any() and graph.r_squared[3] == 0.0 and graph.masks[0, 0] > 0.99
+
+
+def test_degenerate_causes_are_an_error_if_asked_for():
+    rows = with_copy()
+    rows[:, 4] = 0.5
+    with pytest.raises(ValueError, match=r"constant \['pull'\], linearly dependent \[\['x', 'z'\]\]"):
+        graph_of(rows, on_degenerate="raise")
+    assert graph_of(rows_of(2000), on_degenerate="raise").duplicated_variables == ()
+
+
+@pytest.mark.parametrize("where", [slice(0, 60), slice(700, 760)])
+def test_a_variable_that_moves_in_one_block_alone_does_no_harm(where):
+    rows = rows_of(2000)
+    moves = np.zeros(2000, dtype=bool)
+    moves[where] = True
+    for column in (1, 6, 8):
+        rows[~moves, column] = 0.3
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        graph = graph_of(rows)
+    assert graph.masks[0, 0] > 0.99 and np.isfinite(graph.standard_errors).all()
+
+
+def test_one_wild_row_does_no_harm():
+    rows = rows_of(2000)
+    rows[1234, [0, 6]] = 1e9
+    graph = graph_of(rows)
+    assert graph.masks[2, 2] > 0.99 and np.isfinite(graph.effects).all()
+
+
+def test_a_binary_cause_is_found():
+    rows = rows_of(2000)
+    rows[:, 3] = np.sign(rows[:, 3])
+    rows[:, 5] = 0.8 * rows[:, 0] + 0.5 * rows[:, 3] * (rows[:, 1] > 0) + 0.2 * np.random.default_rng(1).standard_normal(2000)
+    graph = graph_of(rows)
+    assert graph.masks[0, 3] > 0.99 and graph.masks[2, 3] < 0.01
+
+
+# Confounding -------------------------------------------------------------------------------------------------------------
+
+
+def confounded_rows():
+    rows = rows_of(1000)
+    rows[:, 3] = rows[:, 0] - 0.5 * rows[:, 1] + 0.05 * rows[:, 3]
+    return rows
+
+
+def test_actions_that_the_states_determine_are_warned_of_once():
+    method = PartialR2()
+    statistics = statistics_of(confounded_rows(), method)
+    with pytest.warns(UserWarning, match=r"almost determine the actions .*: push \(1.5e\+03|: push \(\d") as caught:
+        first = method(statistics, VARIABLES)
+    assert len(caught) == 1 and caught[0].filename == __file__ and "pull" not in str(caught[0].message)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert method(statistics, VARIABLES).action_vif[0] == first.action_vif[0] > 40.0
+    with pytest.warns(UserWarning, match="almost determine"):
+        PartialR2()(statistics, VARIABLES)
+
+
+def test_actions_of_their_own_are_not_warned_of():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        np.testing.assert_allclose(graph_of(rows_of(2000)).action_vif, 1.0, atol=0.02)
+
+
+# Statistics --------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "row_counts"),
+    [({}, (20_000, 180_000)), ({"window": 1000}, (2000, 18_000)), ({"half_life": 500.0}, (2000, 18_000))],
+)
+def test_a_refresh_reads_as_much_after_many_rows_as_after_few(monkeypatch, kwargs, row_counts):
+    method, read = PartialR2(products=False), []
+    statistics = make_statistics(method, VARIABLES, **kwargs)
+    estimate = module._Regression.estimate
+    monkeypatch.setattr(
+        module._Regression, "estimate", lambda self, moments: read[-1].append(moments.comoment.size) or estimate(self, moments)
+    )
+    for n_rows in row_counts:
+        rows = rows_of(n_rows)
+        for start in range(0, n_rows, 500):
+            statistics.update(rows[start : start + 500])
+        read.append([])
+        method(statistics, VARIABLES)
+        assert len(statistics.recent) == 256
+    for sizes in read:
+        assert 2 * 4 < len(sizes) <= 2 * 8 and max(sizes) == (20 + 3) ** 2
+
+
+@pytest.mark.parametrize("kwargs", [{"window": 800}, {"half_life": 300.0}])
+def test_what_is_forgotten_closes_its_edges(kwargs):
+    method = PartialR2()
+    statistics = make_statistics(method, VARIABLES, **kwargs)
+    early, late = rows_of(2000), rows_of(2400, seed=1)
+    late[:, 5] -= 0.8 * late[:, 0]
+    for rows in (early, late):
+        for start in range(0, len(rows), 100):
+            statistics.update(rows[start : start + 100])
+        if rows is early:
+            assert method(statistics, VARIABLES).masks[0, 0] > 0.99
+    graph = method(statistics, VARIABLES)
+    assert graph.masks[0, 0] < 0.1 and graph.masks[0, 3] > 0.99
+
+
+def test_too_few_rows_say_how_many_are_needed():
+    with pytest.raises(ValueError, match=r"needs at least 14 rows .* got 13"):
+        graph_of(rows_of(13))
+    with pytest.raises(ValueError, match=r"needs at least 14 rows .* got 0"):
+        graph_of(rows_of(0))
+    graph_of(rows_of(14))
+
+
+def test_rows_that_are_forgotten_do_not_count():
+    method = PartialR2()
+    statistics = make_statistics(method, VARIABLES, half_life=5.0)
+    for row in rows_of(400)[:, None]:
+        statistics.update(row)
+    with pytest.raises(ValueError, match="not forgotten, got 8"):
+        method(statistics, VARIABLES)
+
+
+def test_wrong_statistics_are_an_error():
+    method = PartialR2()
+    with pytest.raises(ValueError, match="make_statistics makes for"):
+        method(StreamingMoments(VARIABLES.n_variables), VARIABLES)
+    with pytest.raises(ValueError, match="make_statistics makes for"):
+        method(BasisMoments(TransitionVariables(("x",), ("push",))), VARIABLES)
+
+
+@pytest.mark.parametrize(
+    "kwargs",
+    [
+        {"threshold": 0.0},
+        {"threshold": 1.0},
+        {"threshold": float("nan")},
+        {"spread": 0.0},
+        {"spread": float("inf")},
+        {"on_degenerate": "drop"},
+    ],
+)
+def test_bad_arguments_are_errors(kwargs):
+    with pytest.raises(ValueError, match=next(iter(kwargs))):
+        PartialR2(**kwargs)
+
+
+def test_it_is_made_by_name_and_describes_itself():
+    assert DISCOVERY_METHODS["partial_r2"] is PartialR2
+    method = make_discovery("partial_r2", threshold=0.1, products=False)
+    graph = graph_of(rows_of(300), method=method)
+    assert graph.method == "partial_r2" and graph.n_samples == 300 and graph.found_at.endswith("+00:00")
+    assert method.make_statistics(VARIABLES).products is False
+
+
+def test_the_same_rows_give_the_same_graph_twice():
+    method = PartialR2()
+    statistics = statistics_of(rows_of(500), method)
+    first, second = method(statistics, VARIABLES), method(statistics, VARIABLES)
+    for name in ("masks", "effects", "standard_errors", "r_squared"):
+        np.testing.assert_array_equal(getattr(first, name), getattr(second, name))

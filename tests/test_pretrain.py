@@ -1,0 +1,445 @@
+import os
+import warnings
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+from stable_baselines3 import HerReplayBuffer
+from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback, EvalCallback
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import VecNormalize
+
+from sb3_causalgdp import CausalGDP, CausalWorldModelCallback
+from sb3_causalgdp.offline.sources import Source
+
+KWARGS = {
+    "learning_starts": 5,
+    "batch_size": 8,
+    "buffer_size": 1000,
+    "causal_refresh_freq": 10,
+    "seed": 0,
+    "device": "cpu",
+    "policy_kwargs": {"net_arch": [16], "world_model_net_arch": [16, 16]},
+}
+N_ROWS = 400
+GOAL_KEYS = ("observation", "achieved_goal", "desired_goal")
+
+
+def make(env="Pendulum-v1", **kwargs):
+    return CausalGDP("MlpPolicy", env, **{**KWARGS, **kwargs})
+
+
+@pytest.fixture(scope="module")
+def arrays():
+    env = gym.make("Pendulum-v1")
+    env.action_space.seed(0)
+    rows, observation = [], env.reset(seed=0)[0]
+    for step in range(N_ROWS):
+        action = env.action_space.sample()
+        after, reward, terminated, _, _ = env.step(action)
+        truncated = step % 100 == 99
+        rows.append((observation, action, reward, after, terminated, truncated))
+        observation = env.reset()[0] if truncated else after
+    names = ("observations", "actions", "rewards", "next_observations", "terminations", "truncations")
+    return {name: np.stack(values) for name, values in zip(names, zip(*rows, strict=True), strict=True)}
+
+
+@pytest.fixture
+def npz(arrays, tmp_path):
+    np.savez(tmp_path / "data.npz", **arrays)
+    return str(tmp_path / "data.npz")
+
+
+@pytest.fixture
+def model(arrays):
+    return make().preload(arrays)
+
+
+class Counting(BaseCallback):
+    """Keeps the steps that it saw, and stops at one of them."""
+
+    def __init__(self, stop_at=None):
+        super().__init__()
+        self.steps, self.stop_at = [], stop_at
+
+    def _on_step(self):
+        self.steps.append(self.model.num_timesteps)
+        return self.num_timesteps != self.stop_at
+
+
+def states(model):
+    optimizers = (model.actor.optimizer, model.critic.optimizer, model.world_model.optimizer)
+    return [*model.policy.state_dict().values(), *(value for one in optimizers for value in _tensors(one.state_dict()))]
+
+
+def _tensors(tree):
+    if isinstance(tree, th.Tensor):
+        yield tree
+    elif isinstance(tree, dict | list):
+        for part in tree.values() if isinstance(tree, dict) else tree:
+            yield from _tensors(part)
+
+
+def assert_same(states, others):
+    assert all(th.equal(one, other) for one, other in zip(states, others, strict=True))
+
+
+# What it trains, and when ---------------------------------------------------------------------------------------------------
+
+
+def test_everything_is_trained(model):
+    parts = ("actor", "actor_target", "critic", "critic_target", "world_model")
+    before = {part: [value.clone() for value in getattr(model, part).parameters()] for part in parts}
+    assert model.pretrain(5) is model
+    for part in parts:
+        assert any(not th.equal(one, two) for one, two in zip(before[part], getattr(model, part).parameters(), strict=True))
+    assert model._n_updates == 5
+
+
+def test_masks_come_before_the_first_step_and_on_schedule(model, monkeypatch):
+    refreshes, seen = [], []
+
+    class Recording(CausalWorldModelCallback):
+        def refresh(self):
+            super().refresh()
+            refreshes.append(self.model.num_timesteps)
+
+    train = model.train
+    monkeypatch.setattr(model, "train", lambda **kwargs: (seen.append(model.causal_graph().n_samples), train(**kwargs)))
+    model.pretrain(25, callback=Recording())
+    assert refreshes == [0, 10, 20]
+    assert seen == [N_ROWS] * 25
+    assert model.causal_graph().num_timesteps == 0
+
+
+@pytest.mark.parametrize("n_envs", [1, 2])
+def test_a_buffer_that_is_exactly_full_is_fed_whole(n_envs, arrays):
+    model = make(make_vec_env("Pendulum-v1", n_envs=n_envs), buffer_size=N_ROWS).preload(arrays)
+    assert model.replay_buffer.full and model.replay_buffer.pos == 0
+    model.pretrain(12)
+    assert model.causal_statistics.n_samples == N_ROWS
+
+
+def test_a_full_replay_buffer_that_was_loaded_is_fed_whole(arrays, tmp_path):
+    make(buffer_size=N_ROWS).preload(arrays).save_replay_buffer(tmp_path / "buffer")
+    model = make(buffer_size=N_ROWS)
+    model.load_replay_buffer(tmp_path / "buffer")
+    model.offline_buffer = None  # as if another algorithm had saved it
+    model.pretrain(1)
+    assert model.causal_statistics.n_samples == N_ROWS
+
+
+def test_preloaded_and_collected_transitions_are_fed_once(model, arrays):
+    model.pretrain(15)
+    model.learn(35)
+    model.preload({key: values[:100] for key, values in arrays.items()})
+    model.pretrain(12)
+    # learn() feeds before it stores the step
+    assert model.causal_statistics.n_samples == N_ROWS + 35 + 100
+
+
+def test_schedules_go_from_1_to_0_and_learn_starts_anew(arrays):
+    rates = []
+    model = make(learning_rate=lambda remaining: 1e-3 * (0.5 + remaining)).preload(arrays)
+    model.pretrain(4, callback=lambda *_: rates.append(model.actor.optimizer.param_groups[0]["lr"]) or True)
+    np.testing.assert_allclose(rates, [1.5e-3, 1.25e-3, 1.0e-3, 0.75e-3])
+    assert model._current_progress_remaining == 1.0
+
+
+# Callbacks ----------------------------------------------------------------------------------------------------------------
+
+
+def test_callbacks_see_each_gradient_step_and_the_counter_of_steps_comes_back(model):
+    model.learn(7)
+    callback = Counting()
+    model.pretrain(5, callback=callback)
+    assert callback.steps == [1, 2, 3, 4, 5] and callback.n_calls == 5
+    assert model.num_timesteps == 7 and not model.is_pretraining
+    model.learn(3, reset_num_timesteps=False)
+    assert model.num_timesteps == 10
+
+
+def test_it_stops_and_goes_on(model):
+    first, second = Counting(stop_at=3), Counting()
+    model.pretrain(8, callback=first)
+    model.pretrain(5, callback=second)
+    assert first.steps == [1, 2, 3] and second.steps == [4, 5, 6, 7, 8]
+
+
+def test_an_exception_leaves_the_counters_as_they_were(model):
+    def fail(*_):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        model.pretrain(8, callback=fail)
+    assert model.num_timesteps == 0 and not model.is_pretraining
+    model.pretrain(1)
+
+
+def test_evaluations_and_checkpoints_are_numbered_by_gradient_steps(model, tmp_path):
+    env = make_vec_env(lambda: gym.wrappers.TimeLimit(gym.make("Pendulum-v1"), 5))
+    evaluation = EvalCallback(env, eval_freq=4, n_eval_episodes=1, log_path=str(tmp_path), verbose=0)
+    model.pretrain(8, callback=[evaluation, CheckpointCallback(4, str(tmp_path), "offline")])
+    assert np.load(tmp_path / "evaluations.npz")["timesteps"].tolist() == [4, 8]
+    assert sorted(file for file in os.listdir(tmp_path) if file.endswith("zip")) == [
+        "offline_4_steps.zip",
+        "offline_8_steps.zip",
+    ]
+    # A checkpoint of the offline stage has made no step in the environment
+    loaded = CausalGDP.load(tmp_path / "offline_4_steps.zip", device="cpu")
+    assert loaded.num_timesteps == 0 and loaded._n_pretrain_steps == 4 and not loaded.is_pretraining
+
+
+@pytest.mark.parametrize("n_envs", [1, 3])
+def test_a_progress_bar_counts_gradient_steps(n_envs, arrays, capsys):
+    model = make(make_vec_env("Pendulum-v1", n_envs=n_envs)).preload(arrays)
+    model.pretrain(4, progress_bar=True)
+    assert "4/4" in capsys.readouterr().out
+
+
+def test_tensorboard_gets_a_run_of_its_own(arrays, tmp_path):
+    accumulator = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
+    model = make(tensorboard_log=str(tmp_path)).preload(arrays)
+    model.pretrain(4, log_interval=2)
+    model.pretrain(4, log_interval=2)
+    assert os.listdir(tmp_path) == ["offline_1"]
+    events = accumulator.EventAccumulator(str(tmp_path / "offline_1"))
+    events.Reload()
+    assert [event.step for event in events.Scalars("train/critic_loss")] == [2, 4, 6, 8]
+    model.learn(8)
+    assert sorted(os.listdir(tmp_path)) == ["CausalGDP_1", "offline_1"]
+
+
+# Without an environment -----------------------------------------------------------------------------------------------------
+
+
+class Described(Source):
+    """Arrays with spaces."""
+
+    def __init__(self, arrays, observation_space):
+        action_space = spaces.Box(-2.0, 2.0, (1,), np.float32)
+        super().__init__("described", N_ROWS, observation_space, action_space)
+        self.arrays = arrays
+
+    def chunks(self):
+        from sb3_causalgdp.offline.sources import ArraySource
+
+        yield from ArraySource(self.arrays).chunks()
+
+
+def test_a_model_from_a_dataset_needs_no_environment(arrays, tmp_path):
+    source = Described(arrays, gym.make("Pendulum-v1").observation_space)
+    model = CausalGDP.from_dataset(source, **KWARGS)
+    assert model.env is None
+    env = gym.wrappers.TimeLimit(gym.make("Pendulum-v1"), 5)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        evaluation = EvalCallback(env, eval_freq=2, n_eval_episodes=1, verbose=0)
+        model.preload(source).pretrain(2, callback=evaluation, progress_bar=True)
+    assert model.env is None and np.isfinite(evaluation.last_mean_reward)
+    model.save(tmp_path / "model")
+    CausalGDP.load(tmp_path / "model", device="cpu").preload(source).pretrain(1)
+    with pytest.raises(AssertionError, match="must set the environment"):
+        model.learn(5)
+    model.set_env(gym.make("Pendulum-v1"))
+    model.learn(10)
+
+
+def test_dictionaries_are_flattened_for_an_mlp(arrays):
+    space = spaces.Dict(angle=spaces.Box(-1.0, 1.0, (2,)), speed=spaces.Box(-8.0, 8.0, (1,)))
+    split = dict(arrays)
+    for key in ("observations", "next_observations"):
+        split[key] = {"angle": arrays[key][:, :2], "speed": arrays[key][:, 2:]}
+    source = Described(split, space)
+    assert CausalGDP.from_dataset(source, **KWARGS).preload(source).observation_space.shape == (3,)
+    assert CausalGDP.from_dataset(source, "MultiInputPolicy", **KWARGS).preload(source).observation_space == space
+
+
+def test_arrays_do_not_tell_their_spaces(arrays):
+    with pytest.raises(ValueError, match="does not tell its spaces"):
+        CausalGDP.from_dataset(arrays)
+
+
+def test_nothing_to_train_on():
+    with pytest.raises(ValueError, match="nothing to train on: call preload"):
+        make().pretrain(5)
+
+
+# Online -------------------------------------------------------------------------------------------------------------------
+
+
+def test_nothing_is_reset_between_the_stages(model):
+    model.pretrain(12)
+    before, graph, n_updates = [value.clone() for value in states(model)], model.causal_graph(), model._n_updates
+    model.learn(4)  # no update yet
+    assert_same(before, states(model))
+    assert model.causal_graph() == graph and model._n_updates == n_updates
+    assert model.offline_buffer.size() == N_ROWS and model.replay_buffer.size() == 4
+
+
+def n_offline(model, batch_size=1000):
+    """How many rows of a batch were preloaded, by their marked rewards."""
+    model.offline_buffer.rewards[:] = 99.0
+    return int((model._sample(batch_size).rewards == 99.0).sum())
+
+
+@pytest.mark.parametrize(("fraction", "expected"), [(0.5, 500), (0.0, 0), (0.25, 250), (1.0, 1000)])
+def test_batches_are_made_from_both(fraction, expected, arrays):
+    model = make(offline_fraction=fraction).preload(arrays)
+    assert n_offline(model) == 1000
+    model.learn(8)
+    assert n_offline(model) == expected
+
+
+def test_the_fraction_can_be_annealed(arrays):
+    model = make(offline_fraction=lambda remaining: remaining).preload(arrays)
+    model.learn(8)
+    for remaining in (1.0, 0.4, 0.0):
+        model._current_progress_remaining = remaining
+        assert n_offline(model) == round(1000 * remaining)
+
+
+@pytest.mark.parametrize("fraction", [-0.1, 1.5, lambda remaining: 2.0])
+def test_a_fraction_outside_of_0_and_1_is_refused(fraction):
+    with pytest.raises(ValueError, match="offline_fraction must be between 0 and 1"):
+        make(offline_fraction=fraction)
+
+
+def test_online_transitions_never_overwrite_preloaded_ones(arrays):
+    model = make(buffer_size=20).preload(arrays)
+    before = model.offline_buffer.observations.copy()
+    model.learn(50)
+    np.testing.assert_array_equal(model.offline_buffer.observations, before)
+    assert model.replay_buffer.full and model.replay_buffer.buffer_size == 20
+
+
+VARIANTS = {
+    "n-step": {"n_steps": 3},
+    "memory efficient": {"optimize_memory_usage": True, "replay_buffer_kwargs": {"handle_timeout_termination": False}},
+    "several environments": {"env": lambda: make_vec_env("Pendulum-v1", n_envs=3)},
+    "VecNormalize": {"env": lambda: VecNormalize(make_vec_env("Pendulum-v1", n_envs=2))},
+}
+
+
+@pytest.mark.filterwarnings("ignore:The last trajectory in the replay buffer will be truncated")
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_both_stages_work_with_every_kind_of_buffer(variant, arrays, tmp_path):
+    kwargs = dict(VARIANTS[variant])
+    env = kwargs.pop("env", lambda: gym.make("Pendulum-v1"))
+    model = make(env(), **kwargs).preload(arrays).pretrain(3).learn(30)
+    model.save(tmp_path / "model")
+    model.save_replay_buffer(tmp_path / "buffer")
+    loaded = CausalGDP.load(tmp_path / "model", env=env(), device="cpu")
+    loaded.load_replay_buffer(tmp_path / "buffer")
+    assert loaded.offline_buffer.size() == model.offline_buffer.size()
+    assert loaded.replay_buffer.size() == model.replay_buffer.size()
+    fed = loaded.causal_statistics.n_samples
+    loaded.learn(24, reset_num_timesteps=False)
+    assert loaded.causal_statistics.n_samples <= fed + 54
+
+
+class GoalEnv(gym.Env):
+    observation_space = spaces.Dict(
+        {key: spaces.Box(-9.0, 9.0, (2,)) for key in ("observation", "achieved_goal", "desired_goal")}
+    )
+    action_space = spaces.Box(-1.0, 1.0, (2,))
+
+    def reset(self, seed=None, options=None):
+        super().reset(seed=seed)
+        self.n_steps = 0
+        return self.observation_space.sample(), {}
+
+    def step(self, action):
+        self.n_steps += 1
+        return self.observation_space.sample(), 0.0, False, self.n_steps == 20, {}
+
+    def compute_reward(self, achieved_goal, desired_goal, info):
+        return -np.linalg.norm(achieved_goal - desired_goal, axis=-1)
+
+
+@pytest.mark.filterwarnings("ignore:.*trajectory in the replay buffer will be truncated")
+def test_hindsight_replay_takes_preloaded_batches_until_an_episode_has_ended(tmp_path):
+    first = CausalGDP("MultiInputPolicy", GoalEnv(), replay_buffer_class=HerReplayBuffer, **{**KWARGS, "learning_starts": 100})
+    first.learn(60)
+    model = CausalGDP("MultiInputPolicy", GoalEnv(), replay_buffer_class=HerReplayBuffer, **KWARGS)
+    model.preload(first.replay_buffer).pretrain(2).learn(12)
+    assert model._n_updates == 2 + 7
+    model.save(tmp_path / "model")
+    model.save_replay_buffer(tmp_path / "buffer")
+    loaded = CausalGDP.load(tmp_path / "model", env=GoalEnv(), device="cpu")
+    loaded.load_replay_buffer(tmp_path / "buffer")
+    loaded.learn(30, reset_num_timesteps=False)
+    assert loaded.offline_buffer.size() == 60
+
+
+# From the constructor, as a YAML file says it ----------------------------------------------------------------------
+
+
+def test_training_starts_with_the_dataset_and_the_offline_stage(npz):
+    model = make(offline_dataset=npz, pretrain_steps=6)
+    assert model.offline_buffer is None and model._n_updates == 0
+    model.learn(4)
+    assert model.offline_buffer.size() == N_ROWS
+    assert model._n_pretrain_steps == model._n_updates == 6 and model.num_timesteps == 4
+    model.learn(4)
+    assert model._n_pretrain_steps == 6 and model.offline_buffer.size() == N_ROWS
+
+
+def test_an_interrupted_offline_stage_does_the_rest(npz):
+    model = make(offline_dataset=npz, pretrain_steps=6)
+    model.pretrain(6, callback=Counting(stop_at=2))
+    model.learn(4)
+    assert model._n_pretrain_steps == 6
+
+
+def test_a_loaded_model_loads_the_dataset_again_only_where_its_buffer_is_empty(npz, tmp_path):
+    model = make(offline_dataset=npz, pretrain_steps=6).learn(14)
+    model.save(tmp_path / "model")
+    model.save_replay_buffer(tmp_path / "buffer")
+    for has_buffer in (False, True):
+        loaded = CausalGDP.load(tmp_path / "model", env=gym.make("Pendulum-v1"), device="cpu")
+        assert loaded.offline_buffer is None and loaded.replay_buffer.size() == 0
+        if has_buffer:
+            loaded.load_replay_buffer(tmp_path / "buffer")
+        fed = loaded.causal_statistics.n_samples
+        loaded.learn(10, reset_num_timesteps=False)
+        assert loaded.offline_buffer.size() == N_ROWS and loaded._n_pretrain_steps == 6
+        assert fed < loaded.causal_statistics.n_samples <= fed + 15
+
+
+# The two ends ---------------------------------------------------------------------------------------------------------------
+
+
+def test_behaviour_cloning_does_not_listen_to_the_critics(arrays):
+    actors = []
+    for scale in (1.0, -100.0):
+        model = make(eta=0.0, guidance=None, denoising_weight=1.0).preload(arrays)
+        for value in model.critic.parameters():
+            value.data *= scale
+        model.set_random_seed(1)
+        model.pretrain(3)
+        actors.append(list(model.actor.parameters()))
+    assert_same(*actors)
+
+
+@pytest.mark.parametrize("eta", [0.0, 1.0])
+def test_without_guidance_the_actor_minimises_the_loss_of_diffusion_ql(eta, arrays):
+    model = make(eta=eta, guidance=None, denoising_weight=1.0).preload(arrays).pretrain(3)
+    assert model.causal_graph().method != "none" and not model.policy.is_guided
+    values = model.logger.name_to_value
+    expected = values["train/denoising_loss"] + eta * values["train/q_loss"]
+    assert values["train/actor_loss"] == pytest.approx(expected, rel=1e-5)
+
+
+def test_without_guidance_the_world_model_does_not_move_the_actor(arrays):
+    actors = []
+    for scale in (1.0, -100.0):
+        model = make(guidance=None, denoising_weight=1.0).preload(arrays)
+        for value in model.world_model.parameters():
+            value.data *= scale
+        model.set_random_seed(1)
+        model.pretrain(3)
+        actors.append(list(model.actor.parameters()))
+    assert_same(*actors)
