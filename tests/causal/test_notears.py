@@ -283,6 +283,16 @@ def test_edges_among_simultaneous_variables_have_no_cycle(seed):
     assert is_acyclic(method.instantaneous_weights != 0)
 
 
+def test_variables_of_very_different_units_do_no_harm():
+    variables, rows = simultaneous_system(500)
+    rows *= np.array([1.0, 1e-3, 1e3, 1.0, 1.0, 1e-3, 1e3, 1.0])
+    method = Notears(sparsity=1e-4, standardize=False, instantaneous=True)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        graph = method(moments_of(rows), variables)
+    assert np.isfinite(graph.effects).all() and is_acyclic(method.instantaneous_weights != 0)
+
+
 def test_acyclicity_is_zero_without_cycles_alone_and_has_the_right_gradient():
     rng = np.random.default_rng(0)
     acyclic = np.tril(rng.normal(size=(5, 5)), -1)

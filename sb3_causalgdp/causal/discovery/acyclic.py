@@ -4,17 +4,22 @@ import numpy as np
 import torch as th
 
 LARGEST_PENALTY = 1e12
+SMALLEST_STEP = 1e-30
+LARGEST_ACYCLICITY = 1e100  # its square times the penalty stays inside float64
 
 
 def acyclicity(weights: np.ndarray) -> tuple[float, np.ndarray]:
     """
-    ``h(W) = tr(exp(W * W)) - n``, which is 0 for acyclic graphs alone (Zheng et al., 2018, eq. 8), and its gradient.
+    ``h(W) = tr(exp(W * W)) - n``, which is 0 for acyclic graphs alone (Zheng et al., 2018, eq. 8), and its gradient; infinity
+    and zeros where the exponential overflows.
 
     :param weights: Shape (n, n)
     :return: h, at least 0, and dh / dW, shape (n, n)
     """
     exponential = th.matrix_exp(th.as_tensor(weights**2)).numpy()
-    return float(np.trace(exponential)) - len(weights), 2.0 * weights * exponential.T
+    h = float(np.trace(exponential)) - len(weights)
+    # Large weights overflow: a solver then has to take a smaller step
+    return (h, 2.0 * weights * exponential.T) if np.isfinite(exponential).all() else (np.inf, np.zeros_like(weights))
 
 
 def is_acyclic(edges: np.ndarray) -> bool:
@@ -98,6 +103,8 @@ def _solve_lagrangian(
         residual = identity - point
         product = residual @ second_moments
         h, h_gradient = acyclicity(point)
+        if not h < LARGEST_ACYCLICITY:
+            return np.inf, h_gradient
         value = 0.5 * float((product * residual).sum()) + multiplier * h + 0.5 * penalty * h**2
         return value, -product + (multiplier + penalty * h) * h_gradient
 
@@ -105,6 +112,9 @@ def _solve_lagrangian(
     ahead, momentum, objective = weights, 1.0, np.inf
     for _ in range(max_iterations):
         value, gradient = smooth(ahead)
+        if value == np.inf:
+            ahead, momentum = weights, 1.0
+            value, gradient = smooth(ahead)
         while True:
             target = ahead - step * gradient
             new = target - np.clip(target, -step * sparsity, step * sparsity)
@@ -112,8 +122,10 @@ def _solve_lagrangian(
             change = new - ahead
             new_value = smooth(new)[0]
             bound = value + float((gradient * change).sum()) + 0.5 / step * float((change**2).sum())
-            if new_value <= bound + 1e-12 * abs(value) or step < 1e-16:
+            if new_value <= bound + 1e-12 * abs(value):
                 break
+            if step < SMALLEST_STEP:
+                return weights
             step *= 0.5
         new_objective = new_value + sparsity * float(np.abs(new).sum())
         if new_objective > objective:
