@@ -101,10 +101,10 @@ class MaskedWorldModel(nn.Module):
     :meth:`set_masks` is called.
 
     What it costs, in multiply-adds per sample with n states, d actions, L layers and w units per block:
-    ``n w (n + d) + (L - 1) n w^2 + n w`` for the transition model. A block has ``w = max(8, net_arch[0] / sqrt(n))`` units (a multiple of 8), so
-    that the hidden layers of all blocks cost as much as those of one network of the width that ``net_arch`` names. With 256
-    units and 4 layers: HalfCheetah (n=17, d=6) w=64, 0.24 M; Humanoid (n=348, d=17) w=16, 2.3 M, against 0.23 M of one of its
-    Q networks (3 x 256), and 100 M of n separate networks of full width.
+    ``n w (n + d) + (L - 1) n w^2 + n w`` for the transition model. A block has ``w = max(8, net_arch[0] / sqrt(n))`` units (a
+    multiple of 8), so that the hidden layers of all blocks cost as much as those of one network of the width that ``net_arch``
+    names. With 256 units and 4 layers: HalfCheetah (n=17, d=6) w=64, 0.24 M; Humanoid (n=348, d=17) w=16, 2.3 M, against 0.23
+    M of one of its Q networks (3 x 256), and 100 M of n separate networks of full width.
 
     :param state_dim: Number of state variables n
     :param action_dim: Number of action components d
