@@ -5,8 +5,10 @@ from typing import NamedTuple
 import numpy as np
 import torch as th
 
-TARGETS_AT_ONCE = 32  # so that the work of one iteration stays in the processor's cache
-CHECK_EVERY = 10
+TARGETS_AT_ONCE = 128  # so that the systems on the supports stay small in memory
+CHECK_EVERY = 20
+OVER_RELAXATION = 1.7
+PENALTY = 0.3  # of the mean diagonal: with strongly correlated inputs, both larger and smaller ones take more iterations
 RIDGE = 1e-12  # of the mean diagonal: rounding of float64 times a thousand
 
 
@@ -29,10 +31,10 @@ def solve_lasso_gram(
     """
     Minimise ``1/2 w^T G w - c^T w + sparsity ||w||_1`` for m targets.
 
-    FISTA (Beck and Teboulle, 2009) with the gradient restart of O'Donoghue and Candes (2015), each target with momentum of its
-    own; a target whose signs have settled is solved exactly on its support. Stops when the KKT residual (the largest violation
-    of the optimality conditions) is at most ``tolerance`` times the target's largest \\|c\\|. Without sparsity there is a
-    closed form.
+    ADMM with over-relaxation and balanced residuals (Boyd et al., 2011, "Distributed optimization and statistical learning via
+    the alternating direction method of multipliers", 3.4 and 6.4), which one factorisation of G serves for all targets; a
+    target whose signs have settled is solved exactly on its support. Stops when the KKT residual (the largest violation of the
+    optimality conditions) is at most ``tolerance`` times the target's largest \\|c\\|. Without sparsity there is a closed form.
 
     :param gram: G, second moments of the inputs, shape (p, p), positive semi-definite
     :param cross: c, cross moments of inputs and targets, shape (p, m)
@@ -47,13 +49,12 @@ def solve_lasso_gram(
         weights = least_squares_gram(gram, cross)
         return LassoSolution(weights, 0, bool((np.abs(gram @ weights - cross).max(axis=0) <= limit).all()))
     weights = np.zeros_like(cross) if initial is None else np.array(initial, dtype=np.float64)
-    curvature = np.linalg.eigvalsh(gram)[-1]
-    step = 1.0 / curvature if curvature > 0.0 else 0.0
+    spectrum = tuple(part.numpy() for part in th.linalg.eigh(th.as_tensor(gram)))
     iterations, converged = 0, True
     for first in range(0, cross.shape[1], TARGETS_AT_ONCE):
         chunk = slice(first, first + TARGETS_AT_ONCE)
         problem = _Problem(gram, np.ascontiguousarray(cross[:, chunk]), sparsity, limit[chunk])
-        solution = _fista(problem, weights[:, chunk], step, max_iterations)
+        solution = _admm(problem, weights[:, chunk], spectrum, max_iterations)
         weights[:, chunk] = solution.weights
         iterations, converged = max(iterations, solution.iterations), converged and solution.converged
     return LassoSolution(weights, iterations, converged)
@@ -95,48 +96,60 @@ class _Problem(NamedTuple):
         return self._replace(cross=self.cross[:, chosen], limit=self.limit[chosen])
 
 
-def _fista(problem: _Problem, initial: np.ndarray, step: float, max_iterations: int) -> LassoSolution:
-    """Products with G are carried along, so an iteration costs one of them, and solved targets leave."""
+def _admm(
+    problem: _Problem, initial: np.ndarray, spectrum: tuple[np.ndarray, np.ndarray], max_iterations: int
+) -> LassoSolution:
+    """Solved targets leave; the others start where they were with a new penalty."""
     weights = initial.copy()
     columns = np.arange(weights.shape[1])
-    gram = problem.gram
-    current, product = weights.copy(), gram @ weights
-    ahead, ahead_product = current, product
-    momentum = np.ones(len(columns))
+    current, dual = weights.copy(), problem.cross - problem.gram @ weights
+    np.clip(dual, -problem.sparsity, problem.sparsity, out=dual)
+    penalty = PENALTY * max(float(spectrum[0].mean()), np.finfo(np.float64).tiny)
     signs_then = np.sign(weights)
     iteration = 0
     while True:
-        if iteration % CHECK_EVERY == 0:
-            open_ = ~problem.solved(current, product)
-            signs = np.sign(current)
-            settled = np.flatnonzero(open_ & (signs == signs_then).all(axis=0))
-            exact, is_solved = _solve_on_support(problem.of_targets(settled), current[:, settled])
-            current[:, settled[is_solved]] = exact[:, is_solved]
-            open_[settled[is_solved]] = False
-            weights[:, columns] = current
-            columns, problem, momentum, signs_then = (
-                columns[open_],
-                problem.of_targets(open_),
-                momentum[open_],
-                signs[:, open_],
-            )
-            current, product = current[:, open_], product[:, open_]
-            ahead, ahead_product = ahead[:, open_], ahead_product[:, open_]
+        product = problem.gram @ current
+        open_ = ~problem.solved(current, product)
+        signs = np.sign(current)
+        settled = np.flatnonzero(open_ & (signs == signs_then).all(axis=0))
+        exact, is_solved = _solve_on_support(problem.of_targets(settled), current[:, settled])
+        current[:, settled[is_solved]] = exact[:, is_solved]
+        open_[settled[is_solved]] = False
+        weights[:, columns] = current
+        columns, problem, signs_then = columns[open_], problem.of_targets(open_), signs[:, open_]
         if len(columns) == 0 or iteration >= max_iterations:
-            break
-        iteration += 1
-        downhill = ahead - step * (ahead_product - problem.cross)
-        new = downhill - np.clip(downhill, -step * problem.sparsity, step * problem.sparsity)
-        new_product = gram @ new
-        change = new - current
-        uphill = np.einsum("ij,ij->j", ahead - new, change) > 0.0
-        next_momentum = np.where(uphill, 1.0, (1.0 + np.sqrt(1.0 + 4.0 * momentum**2)) / 2.0)
-        inertia = np.where(uphill, 0.0, (momentum - 1.0) / next_momentum)
-        ahead = new + inertia * change
-        ahead_product = new_product + inertia * (new_product - product)
-        current, product, momentum = new, new_product, next_momentum
-    weights[:, columns] = current
-    return LassoSolution(weights, iteration, len(columns) == 0)
+            return LassoSolution(weights, iteration, len(columns) == 0)
+        n_steps = min(CHECK_EVERY, max_iterations - iteration)
+        current, dual, ratio = _admm_steps(problem, current[:, open_], dual[:, open_], spectrum, penalty, n_steps)
+        iteration += n_steps
+        penalty *= float(np.clip(np.sqrt(ratio), 0.5, 2.0))
+
+
+def _admm_steps(
+    problem: _Problem,
+    current: np.ndarray,
+    dual: np.ndarray,
+    spectrum: tuple[np.ndarray, np.ndarray],
+    penalty: float,
+    n_steps: int,
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """
+    :param current: Sparse weights, shape (p, m)
+    :param dual: What the L1 norm pulls with, within +-sparsity, shape (p, m)
+    :return: both after some steps, and the primal residual relative to the dual one
+    """
+    values, vectors = spectrum
+    inverse = (vectors / (values.clip(min=0.0) + penalty)) @ vectors.T
+    threshold = problem.sparsity / penalty
+    for _ in range(n_steps):
+        smooth = inverse @ (problem.cross - dual + penalty * current)
+        shifted = OVER_RELAXATION * smooth + (1.0 - OVER_RELAXATION) * current + dual / penalty
+        before, clipped = current, np.clip(shifted, -threshold, threshold)
+        current, dual = shifted - clipped, penalty * clipped
+    primal, change = np.linalg.norm(smooth - current), penalty * np.linalg.norm(current - before)
+    scales = max(np.linalg.norm(smooth), np.linalg.norm(current)), np.linalg.norm(dual)
+    tiny = np.finfo(np.float64).tiny
+    return current, dual, float((primal / max(scales[0], tiny) + tiny) / (change / max(scales[1], tiny) + tiny))
 
 
 def _solve_on_support(problem: _Problem, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
