@@ -34,7 +34,8 @@ def solve_lasso_gram(
     ADMM with over-relaxation and balanced residuals (Boyd et al., 2011, "Distributed optimization and statistical learning via
     the alternating direction method of multipliers", 3.4 and 6.4), which one factorisation of G serves for all targets; a
     target whose signs have settled is solved exactly on its support. Stops when the KKT residual (the largest violation of the
-    optimality conditions) is at most ``tolerance`` times the target's largest \\|c\\|. Without sparsity there is a closed form.
+    optimality conditions) is at most ``tolerance`` times the target's largest \\|c\\|. Without sparsity there is a closed
+    form.
 
     :param gram: G, second moments of the inputs, shape (p, p), positive semi-definite
     :param cross: c, cross moments of inputs and targets, shape (p, m)
