@@ -2,7 +2,7 @@ import os
 
 import numpy as np
 
-from sb3_causalgdp.causal.graph import PLOTS_HINT
+from sb3_causalgdp.causal.graph import PLOTS_HINT, replaced_when_done
 from sb3_causalgdp.causal.interventions import ActionEffects
 
 try:
@@ -53,7 +53,8 @@ def plot_action_effects(
         fontsize=FONT_SIZE + 1,
     )
     if path is not None:
-        figure.savefig(path, dpi=120)
+        with replaced_when_done(path) as temporary:
+            figure.savefig(temporary, dpi=120)
     return figure
 
 

@@ -394,13 +394,14 @@ class CausalGraph:
 @contextmanager
 def replaced_when_done(path: str | os.PathLike[str]) -> Iterator[Path]:
     """
-    Give a temporary file beside ``path`` to write to; it takes the place of ``path`` if the block ends without an error.
+    Give a temporary file beside ``path``, of the same suffix, to write to; it takes the place of ``path`` if the block ends
+    without an error.
 
     :param path: File to write; its folder is created
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}")
+    temporary = path.with_name(f".{uuid.uuid4().hex}.{path.name}")
     try:
         yield temporary
         os.replace(temporary, path)

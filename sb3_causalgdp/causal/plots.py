@@ -553,4 +553,4 @@ def _save(figure: Figure, path: str | os.PathLike[str] | None) -> None:
     """Write the picture; a reader sees the old file or the new one, never a half."""
     if path is not None:
         with replaced_when_done(path) as temporary:
-            figure.savefig(temporary, dpi=DPI, format=os.path.splitext(path)[1].lower().lstrip("."))
+            figure.savefig(temporary, dpi=DPI)

@@ -1,7 +1,7 @@
 import numpy as np
 import numpy.typing as npt
 
-from sb3_causalgdp.causal.moments import Moments, StreamingMoments
+from sb3_causalgdp.causal.moments import StreamingMoments
 from sb3_causalgdp.causal.variables import TransitionVariables
 
 
@@ -90,12 +90,6 @@ class RecentRows:
         if self._ring is not None and len(self._ring) < self.window:
             kept, self._ring = self._ring, np.empty((self.window, self.variables.n_variables), dtype=np.float32)
             self._ring[: len(kept)] = kept
-
-    def total(self) -> Moments:
-        """
-        :return: moments of the stream
-        """
-        return self.moments.total()
 
 
 def checked_rows(statistics: RecentRows, variables: TransitionVariables, method: str, needed: int) -> np.ndarray:

@@ -3,6 +3,8 @@
 import importlib
 from typing import Any
 
+OFFLINE_HINT = 'pip install "sb3_causalgdp[offline]"'
+
 
 def need(module: str) -> Any:
     """
@@ -15,4 +17,4 @@ def need(module: str) -> Any:
     try:
         return importlib.import_module(module)
     except ImportError as error:
-        raise ImportError(f'{module} cannot be imported ({error}): pip install "sb3_causalgdp[offline]"') from error
+        raise ImportError(f"{module} cannot be imported ({error}): {OFFLINE_HINT}") from error

@@ -13,7 +13,8 @@ from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.save_util import load_from_pkl
 
-OFFLINE_HINT = 'pip install "sb3_causalgdp[offline]"'
+from sb3_causalgdp.offline.extras import OFFLINE_HINT
+
 MINARI_ID = re.compile(r"(\w+://[-\w]+/)?[-\w]+(/[-\w]+)*-v\d+")
 ARRAYS = ("observations", "actions", "rewards", "next_observations", "terminations", "truncations")
 CHUNK_ROWS = 10_000

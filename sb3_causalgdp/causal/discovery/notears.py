@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sb3_causalgdp.causal.degenerate import find_degeneracy, variance_inflation
+from sb3_causalgdp.causal.degenerate import Degeneracy, find_degeneracy, variance_inflation
 from sb3_causalgdp.causal.discovery.acyclic import notears, without_cycles
 from sb3_causalgdp.causal.discovery.lasso import least_squares_gram, solve_lasso_gram
 from sb3_causalgdp.causal.graph import CausalGraph
@@ -20,7 +20,7 @@ class _Part(NamedTuple):
     masks: np.ndarray  # (m, p)
     r_squared: np.ndarray  # (m,)
     standard_errors: np.ndarray | None  # (m, p)
-    groups: tuple[tuple[int, ...], ...]
+    degeneracy: Degeneracy
 
 
 def weight_masks(weights: np.ndarray, edge_threshold: float, mask_scale: float) -> np.ndarray:
@@ -120,7 +120,6 @@ class Notears:
         dynamics = self._solve(problem, now, after[:n_states], start[:-1], self.instantaneous)
         reward = self._solve(problem, after, np.array([variables.reward]), start[-1:])
         known = dynamics.standard_errors is not None and reward.standard_errors is not None
-        names = np.array(variables.names)
         return CausalGraph(
             variables,
             np.concatenate([dynamics.masks, reward.masks]),
@@ -131,8 +130,8 @@ class Notears:
             r_squared=np.concatenate([dynamics.r_squared, reward.r_squared]),
             action_vif=variance_inflation(problem.correlation[:n_inputs, :n_inputs])[n_states:],
             found_at=datetime.now(timezone.utc).isoformat(timespec="seconds"),
-            constant_variables=tuple(names[moments.constant].tolist()),
-            duplicated_variables=tuple(tuple(names[sorted(group)].tolist()) for group in dynamics.groups),
+            constant_variables=tuple(np.array(variables.names)[moments.constant].tolist()),
+            duplicated_variables=dynamics.degeneracy.names_of_groups(variables.names),
         )
 
     def mask(self, weights: np.ndarray) -> np.ndarray:
@@ -190,7 +189,7 @@ class Notears:
             weights[:, variable] = sign * weights[:, stand_in]
             if errors is not None:
                 errors[:, variable] = errors[:, stand_in]
-        return _Part(weights, degeneracy.share(self.mask(weights)), r_squared, errors, degeneracy.groups)
+        return _Part(weights, degeneracy.share(self.mask(weights)), r_squared, errors, degeneracy)
 
     def _lasso(self, gram: np.ndarray, cross: np.ndarray, initial: np.ndarray) -> np.ndarray:
         solution = solve_lasso_gram(gram, cross, self.sparsity, initial.T, self.max_iterations, self.tolerance)
