@@ -35,9 +35,12 @@ from sb3_causalgdp.causal.interventions import ActionRule
 from sb3_causalgdp.causal.world_model import MaskedWorldModel
 from sb3_causalgdp.losses import critic_loss, denoising_loss, q_loss, td_target, world_model_loss
 from sb3_causalgdp.offline.algorithm import OfflineToOnlineAlgorithm, callback_list
-from sb3_causalgdp.offline.replay import concatenate_samples
+from sb3_causalgdp.offline.replay import concatenate_samples, split_sample
 from sb3_causalgdp.policies import CausalGDPPolicy, CnnPolicy, DiffusionActor, MlpPolicy, MultiInputPolicy, q_values
 from sb3_causalgdp.structural import StatePolicy, actions_of, make_structural_model, states_of
+
+ACTOR_UPDATES = ("one_step", "chain")
+COMPILED_LOSSES = ("_td_target", "_critic_loss", "_world_model_losses", "_actor_losses")
 
 SelfCausalGDP = TypeVar("SelfCausalGDP", bound="CausalGDP")
 
@@ -76,6 +79,9 @@ class CausalGDP(OfflineToOnlineAlgorithm):
     :param eta: Weight of the Q term in the policy loss (the paper's table: 0.005 to 5)
     :param denoising_weight: Weight of the denoising term in the policy loss: 1 is Diffusion-QL's, for fixed datasets; online,
         where it pulls towards the actions of older policies, it has to be small
+    :param actor_update: Which action the Q term of the policy loss judges. ``one_step``: the clean action that the noise
+        prediction of the denoising term gives already (EDP, https://arxiv.org/abs/2305.20081), half the cost of an update;
+        ``chain``: the end of the whole chain, through which the gradient then flows (Diffusion-QL)
     :param max_q_backup: Whether the TD target takes the best of ten sampled actions (Diffusion-QL, for AntMaze)
     :param max_grad_norm: Bound of the gradient norms of the actor and of the critics, None for no bound
     :param diffusion_steps: Number of diffusion steps K
@@ -114,6 +120,10 @@ class CausalGDP(OfflineToOnlineAlgorithm):
     :param tensorboard_log: The log location for tensorboard (if None, no logging)
     :param policy_kwargs: Additional arguments to be passed to the policy on creation, see
         :class:`~sb3_causalgdp.policies.CausalGDPPolicy`
+    :param compile: Whether to compile the losses with ``torch.compile``, or its ``mode``, such as ``"reduce-overhead"`` for
+        CUDA graphs; the first updates then take minutes. Saved models do not depend on it
+    :param torch_threads: PyTorch's number of CPU threads during updates; None leaves it as it is. ``"auto"`` is 1 where
+        observations are vectors, whose networks are so small that threads only wait for each other, and otherwise None
     :param verbose: Verbosity level: 0 for no output, 1 for info messages (such as device or wrappers used), 2 for debug
         messages
     :param seed: Seed for the pseudo random generators
@@ -139,6 +149,7 @@ class CausalGDP(OfflineToOnlineAlgorithm):
     REWARD_QUANTILE = 0.99
     N_BACKUP_ACTIONS = 10
     GRAPHS_IN_HISTORY = 32
+    MOST_ROWS_PER_DRAW = 16_384
 
     def __init__(
         self,
@@ -161,6 +172,7 @@ class CausalGDP(OfflineToOnlineAlgorithm):
         world_model_learning_rate: float | Schedule = 1e-3,
         eta: float = 1.0,
         denoising_weight: float = 0.05,
+        actor_update: str = "one_step",
         max_q_backup: bool = False,
         max_grad_norm: float | None = None,
         diffusion_steps: int = 5,
@@ -187,6 +199,8 @@ class CausalGDP(OfflineToOnlineAlgorithm):
         stats_window_size: int = 100,
         tensorboard_log: str | None = None,
         policy_kwargs: dict[str, Any] | None = None,
+        compile: bool | str = False,
+        torch_threads: int | str | None = "auto",
         verbose: int = 0,
         seed: int | None = None,
         device: th.device | str = "auto",
@@ -226,6 +240,7 @@ class CausalGDP(OfflineToOnlineAlgorithm):
         self.world_model_learning_rate = world_model_learning_rate
         self.eta = eta
         self.denoising_weight = denoising_weight
+        self.actor_update = actor_update
         self.max_q_backup = max_q_backup
         self.max_grad_norm = max_grad_norm
         self.diffusion_steps = diffusion_steps
@@ -245,6 +260,8 @@ class CausalGDP(OfflineToOnlineAlgorithm):
         self.causal_refresh_freq = causal_refresh_freq
         self.causal_half_life = causal_half_life
         self.causal_window = causal_window
+        self.compile = compile
+        self.torch_threads = torch_threads
         # What is known of the causal structure, saved with the model
         self.causal_statistics: Statistics | None = None
         self._statistics_made_by: list[Any] | None = None
@@ -271,12 +288,20 @@ class CausalGDP(OfflineToOnlineAlgorithm):
         finally:
             self.policy_kwargs = policy_kwargs
         self._create_aliases()
+        self._setup_compile()
         self._setup_discovery()
         # Running mean and running var
         self.actor_batch_norm_stats = get_parameters_by_name(self.actor, ["running_"])
         self.critic_batch_norm_stats = get_parameters_by_name(self.critic, ["running_"])
         self.actor_batch_norm_stats_target = get_parameters_by_name(self.actor_target, ["running_"])
         self.critic_batch_norm_stats_target = get_parameters_by_name(self.critic_target, ["running_"])
+
+    def _setup_compile(self) -> None:
+        for name in COMPILED_LOSSES:
+            loss = getattr(type(self), name).__get__(self)
+            if self.compile:
+                loss = th.compile(loss, mode=None if self.compile is True else self.compile)
+            setattr(self, name, loss)
 
     def _setup_discovery(self) -> None:
         self.discovery = make_discovery(self.causal_discovery, **self.causal_discovery_kwargs)
@@ -301,6 +326,11 @@ class CausalGDP(OfflineToOnlineAlgorithm):
                 raise ValueError(f"{name} must be a finite number of at least 0, got {value!r}")
         if self.causal_refresh_freq < 1:
             raise ValueError(f"causal_refresh_freq must be at least 1 environment step, got {self.causal_refresh_freq!r}")
+        if self.actor_update not in ACTOR_UPDATES:
+            raise ValueError(f"Unknown actor_update {self.actor_update!r}: it must be one of {list(ACTOR_UPDATES)}")
+        threads = self.torch_threads
+        if not (threads in (None, "auto") or (isinstance(threads, int) and not isinstance(threads, bool) and threads >= 1)):
+            raise ValueError(f"torch_threads must be 'auto', None or an integer of at least 1, got {threads!r}")
         if self.max_grad_norm is not None and self.max_grad_norm <= 0.0:
             raise ValueError(f"max_grad_norm must be positive or None, got {self.max_grad_norm!r}")
 
@@ -453,13 +483,22 @@ class CausalGDP(OfflineToOnlineAlgorithm):
         # Switch to train mode (this affects batch norm / dropout)
         self.policy.set_training_mode(True)
         self._update_learning_rates()
-        losses: dict[str, list[float]] = {}
-        for _ in range(gradient_steps):
+        with _threads(self._n_threads()):
+            losses = self._gradient_steps(gradient_steps, batch_size)
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+        if losses:
+            # One transfer from the device for all of them
+            means = th.stack([th.stack(values).mean() for values in losses.values()]).tolist()
+            for name, mean in zip(losses, means, strict=True):
+                self.logger.record(f"train/{name}", mean)
+
+    def _gradient_steps(self, gradient_steps: int, batch_size: int) -> dict[str, list[th.Tensor]]:
+        losses: dict[str, list[th.Tensor]] = {}
+        for replay_data, one_step in self._batches(gradient_steps, batch_size):
             self._n_updates += 1
-            replay_data = self._sample(batch_size)
-            one_step = replay_data
-            if isinstance(self.replay_buffer, NStepReplayBuffer):
-                one_step = self._sample(batch_size, one_step=True)
+            if self.compile:
+                # What a CUDA graph returned is overwritten from here on
+                th.compiler.cudagraph_mark_step_begin()
             next_actions, step_losses = self._update_critics(replay_data)
             step_losses.update(self._update_world_model(one_step))
             if one_step is not replay_data:
@@ -468,11 +507,28 @@ class CausalGDP(OfflineToOnlineAlgorithm):
             step_losses.update(self._update_actor(one_step, next_actions))
             self._update_targets()
             for name, loss in step_losses.items():
-                losses.setdefault(name, []).append(loss.item())
+                losses.setdefault(name, []).append(loss.detach().clone())
+        return losses
 
-        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
-        for name, values in losses.items():
-            self.logger.record(f"train/{name}", np.mean(values))
+    def _n_threads(self) -> int | None:
+        if self.torch_threads != "auto":
+            return self.torch_threads  # type: ignore[return-value]
+        return None if self.policy.has_image_state else 1
+
+    def _batches(self, gradient_steps: int, batch_size: int) -> Iterator[tuple[Any, Any]]:
+        """The batches of each gradient step, for the critics and for the one-step models; drawn many at a time."""
+        most_at_once = 1 if self.policy.has_image_state else max(1, self.MOST_ROWS_PER_DRAW // batch_size)
+        done = 0
+        while done < gradient_steps:
+            n_batches = min(most_at_once, gradient_steps - done)
+            batches = one_step = self._draw_batches(n_batches, batch_size)
+            if isinstance(self.replay_buffer, NStepReplayBuffer):
+                one_step = self._draw_batches(n_batches, batch_size, one_step=True)
+            yield from zip(batches, one_step, strict=True)
+            done += n_batches
+
+    def _draw_batches(self, n_batches: int, batch_size: int, one_step: bool = False) -> list[Any]:
+        return split_sample(self._sample(n_batches * batch_size, one_step), n_batches)
 
     def _sample(self, batch_size: int, one_step: bool = False) -> Any:
         """A batch from the replay buffer, from the preloaded transitions, or from both."""
@@ -493,11 +549,11 @@ class CausalGDP(OfflineToOnlineAlgorithm):
     def _update_critics(self, replay_data) -> tuple[th.Tensor, dict[str, th.Tensor]]:
         with th.no_grad():
             next_actions, target = self._td_target(replay_data)
-        loss = critic_loss(self.critic(replay_data.observations, replay_data.actions), target)
+        loss = self._critic_loss(replay_data, target)
         self._optimize(self.critic, loss)
         with th.no_grad():
             self.policy.return_std.lerp_(target.std(correction=0).clamp(min=1e-3), self._running_weight())
-        return next_actions, {"critic_loss": loss.detach()}
+        return next_actions, {"critic_loss": loss}
 
     def _td_target(self, replay_data) -> tuple[th.Tensor, th.Tensor]:
         # For n-step replay, discount factor is gamma**n_steps (when no early termination)
@@ -510,6 +566,9 @@ class CausalGDP(OfflineToOnlineAlgorithm):
         next_q_values = q_values(self.critic_target, critic_features.repeat_interleave(n_actions, dim=0), next_actions)
         target = td_target(next_q_values, replay_data.rewards, replay_data.dones, discounts, n_actions)
         return next_actions[::n_actions], target
+
+    def _critic_loss(self, replay_data, target: th.Tensor) -> th.Tensor:
+        return critic_loss(self.critic(replay_data.observations, replay_data.actions), target)
 
     def _running_weight(self) -> float:
         # The first batches are averaged, so that the start value is forgotten at once
@@ -526,29 +585,36 @@ class CausalGDP(OfflineToOnlineAlgorithm):
         weight = 1.0 - transitions.dones.flatten() if self.optimize_memory_usage else None
         known = slice(None) if weight is None else weight > 0.0
         self.world_model.update_statistics(state[known], next_state[known], rewards[known])
-        transition, reward = world_model_loss(self.world_model, state, transitions.actions, next_state, rewards, weight)
+        transition, reward = self._world_model_losses(state, transitions.actions, next_state, rewards, weight)
         self._optimize(self.world_model, transition + reward)
-        return {"world_model_transition_loss": transition.detach(), "world_model_reward_loss": reward.detach()}
+        return {"world_model_transition_loss": transition, "world_model_reward_loss": reward}
+
+    def _world_model_losses(self, *transitions: th.Tensor | None) -> tuple[th.Tensor, th.Tensor]:
+        return world_model_loss(self.world_model, *transitions)  # type: ignore[arg-type]
 
     def _update_actor(self, transitions, next_actions: th.Tensor) -> dict[str, th.Tensor]:
-        features = self.actor.features(transitions.observations)
-        guidance = rule = None
-        if self.policy.is_guided:
-            rule = self.policy.guidance_rule
-            guidance = self.policy.make_guidance(
-                self.policy.causal_state(transitions.observations),
-                self.policy.causal_state(transitions.next_observations),
-                next_actions,
-            )
-        denoising = denoising_loss(self.actor.denoiser, self.actor.schedule, features, transitions.actions, guidance, rule)
-        with th.no_grad():
-            critic_features = self.critic.extract_features(transitions.observations, self.critic.features_extractor)
+        climbed = int(np.random.randint(len(self.critic.q_networks)))
         with _frozen(self.critic.q_networks):
-            actor_q_values = q_values(self.critic, critic_features, self.actor.sample(features))
-            q_term = q_loss(actor_q_values, int(np.random.randint(len(actor_q_values))))
+            denoising, q_term = self._actor_losses(transitions, next_actions, climbed, self.policy.is_guided)
             loss = self.denoising_weight * denoising + self.eta * q_term
             self._optimize(self.actor, loss)
-        return {"actor_loss": loss.detach(), "denoising_loss": denoising.detach(), "q_loss": q_term.detach()}
+        return {"actor_loss": loss, "denoising_loss": denoising, "q_loss": q_term}
+
+    def _actor_losses(self, transitions, next_actions: th.Tensor, climbed: int, guided: bool) -> tuple[th.Tensor, th.Tensor]:
+        observations = transitions.observations
+        features = self.actor.features(observations)
+        guidance = rule = None
+        if guided:
+            rule = self.policy.guidance_rule
+            state, next_state = self.policy.causal_state(observations), self.policy.causal_state(transitions.next_observations)
+            guidance = self.policy.make_guidance(state, next_state, next_actions)
+        denoising, clean_actions = denoising_loss(
+            self.actor.denoiser, self.actor.schedule, features, transitions.actions, guidance, rule
+        )
+        actions = clean_actions if self.actor_update == "one_step" else self.actor.sample(features)
+        with th.no_grad():
+            critic_features = self.critic.extract_features(observations, self.critic.features_extractor)
+        return denoising, q_loss(q_values(self.critic, critic_features, actions), climbed)
 
     def _optimize(self, module: th.nn.Module, loss: th.Tensor) -> None:
         optimizer = _optimizer_of(module)
@@ -558,9 +624,12 @@ class CausalGDP(OfflineToOnlineAlgorithm):
             th.nn.utils.clip_grad_norm_(module.parameters(), self.max_grad_norm)
         optimizer.step()
 
+    @th.no_grad()
     def _update_targets(self) -> None:
-        polyak_update(self.critic.parameters(), self.critic_target.parameters(), self.tau)
-        polyak_update(self.actor.parameters(), self.actor_target.parameters(), self.tau)
+        # All parameters in one call, as SB3's polyak_update does one by one
+        online = (*self.critic.parameters(), *self.actor.parameters())
+        targets = (*self.critic_target.parameters(), *self.actor_target.parameters())
+        th._foreach_lerp_(targets, online, self.tau)
         # Copy running stats, see SB3's GH issue #996
         polyak_update(self.critic_batch_norm_stats, self.critic_batch_norm_stats_target, 1.0)
         polyak_update(self.actor_batch_norm_stats, self.actor_batch_norm_stats_target, 1.0)
@@ -658,6 +727,7 @@ class CausalGDP(OfflineToOnlineAlgorithm):
             "critic",
             "critic_target",
             "world_model",
+            *COMPILED_LOSSES,
             "discovery",
             "_fed_offline_position",
             "causal_graph_history",
@@ -676,6 +746,20 @@ def _optimizer_of(module: th.nn.Module) -> th.optim.Optimizer:
     optimizer = module.optimizer
     assert isinstance(optimizer, th.optim.Optimizer)
     return optimizer
+
+
+@contextmanager
+def _threads(n_threads: int | None) -> Iterator[None]:
+    """PyTorch's number of CPU threads, for a while."""
+    before = th.get_num_threads()
+    if n_threads in (None, before):
+        yield
+        return
+    th.set_num_threads(n_threads)  # type: ignore[arg-type]
+    try:
+        yield
+    finally:
+        th.set_num_threads(before)
 
 
 @contextmanager

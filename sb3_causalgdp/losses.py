@@ -50,7 +50,7 @@ def denoising_loss(
     actions: th.Tensor,
     guidance: Guidance | None = None,
     rule: GuidanceRule | None = None,
-) -> th.Tensor:
+) -> tuple[th.Tensor, th.Tensor]:
     """
     ``E || eps_theta(a^k, k, s) - eps_cg ||^2``: the noise really injected, shifted by the guidance (stop-gradient).
 
@@ -60,16 +60,19 @@ def denoising_loss(
     :param actions: Clean actions, shape ``(batch, d)``
     :param guidance: What shifts the target, None for the plain denoising loss
     :param rule: How the guidance enters, needed with a guidance
-    :return: Mean over the batch and the action's components
+    :return: Mean over the batch and the action's components; and the clean actions that the same noise prediction gives,
+        clipped to [-1, 1], shape ``(batch, d)``: one step stands for the whole chain in the policy improvement of EDP (Kang
+        et al., 2023, equation 9)
     """
     step = th.randint(schedule.n_steps, (len(actions),), device=actions.device)
     noise = th.randn_like(actions)
     noisy = schedule.add_noise(actions, noise, step)
     predict_noise = bind(denoiser, features)
     predicted = predict_noise(noisy, step)
+    clean_action = schedule.clean_estimate(noisy, predicted, step).clamp(-1.0, 1.0)
     if guidance is not None and rule is not None:
         noise = noise - guidance_shift(guidance, rule, predict_noise, schedule, noisy, predicted.detach(), step)
-    return F.mse_loss(predicted, noise)
+    return F.mse_loss(predicted, noise), clean_action
 
 
 def q_loss(q_values: Sequence[th.Tensor], index: int) -> th.Tensor:

@@ -18,6 +18,7 @@ from stable_baselines3.common.torch_layers import (
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
+from sb3_causalgdp.acting import NumpyActing
 from sb3_causalgdp.causal import CausalGuidance, LinearisedGuidance, MaskedWorldModel, ReturnTarget, RewardTarget
 from sb3_causalgdp.causal.guidance import OutcomeTarget
 from sb3_causalgdp.diffusion import Guidance, GuidanceRule, MLPDenoiser, NoiseSchedule, sample
@@ -312,6 +313,7 @@ class CausalGDPPolicy(BasePolicy):
         self._build(lr_schedule)
 
     def _build(self, lr_schedule: Schedule) -> None:
+        self._acting: NumpyActing | None = None
         self.actor = self.make_actor()
         self.actor_target = self.make_actor()
         self.actor_target.load_state_dict(self.actor.state_dict())
@@ -493,13 +495,14 @@ class CausalGDPPolicy(BasePolicy):
         :param action: The best candidate, shape ``(batch, d)``
         :return: The guidance for these states
         """
-        next_state, _ = self.world_model.predict_next_state(state, action)
+        response = self.world_model.action_response(state, action)
+        next_state = response.next_state
         next_action = action
         if self.guidance_target == "return" and not self.has_image_state:
             features = self._features_of_state(next_state, self.actor.features_extractor)
             noise = th.zeros(self.actor.schedule.n_steps, *action.shape, dtype=action.dtype, device=action.device)
             next_action = self.actor.sample(features, noise)
-        return LinearisedGuidance(self.make_guidance(state, next_state, next_action), action)
+        return LinearisedGuidance(self.make_guidance(state, next_state, next_action), action, response)
 
     # Prediction ---------------------------------------------------------------------------------------------------------
 
@@ -515,8 +518,24 @@ class CausalGDPPolicy(BasePolicy):
 
     def _act(self, observation: PyTorchObs, deterministic: bool) -> th.Tensor:
         features = self.actor.features(observation)
-        critic_features = self.critic_target.extract_features(observation, self.critic_target.features_extractor)
         noise = self._candidate_noise(len(features), deterministic)
+        acting = self._numpy_acting(noise.shape[1])
+        if acting is not None:
+            return th.as_tensor(acting(self, features.numpy(), noise.numpy(), self.is_guided))
+        return self._act_in_torch(observation, features, noise)
+
+    def _numpy_acting(self, n_rows: int) -> NumpyActing | None:
+        """The fast path for few rows, where it covers this policy; made anew when the networks were moved or replaced."""
+        if n_rows > NumpyActing.MOST_ROWS or self.training:
+            return None
+        if self._acting is not None and not self._acting.is_current(self):
+            self._acting = None
+        if self._acting is None and NumpyActing.covers(self):
+            self._acting = NumpyActing(self)
+        return self._acting
+
+    def _act_in_torch(self, observation: PyTorchObs, features: th.Tensor, noise: th.Tensor) -> th.Tensor:
+        critic_features = self.critic_target.extract_features(observation, self.critic_target.features_extractor)
         candidates = self.actor.sample(features.repeat_interleave(self.n_action_candidates, dim=0), noise)
         best = self._best_candidate(critic_features, candidates)
         action = candidates[best]

@@ -71,9 +71,9 @@ def pull(action):
 def test_a_perfect_denoiser_has_no_loss():
     th.manual_seed(0)
     actions = th.rand(64, 2) * 2 - 1
-    assert denoising_loss(PerfectDenoiser(), SCHEDULE, actions, actions).item() < 1e-8
-    assert denoising_loss(PerfectDenoiser(), SCHEDULE, actions, actions, None, GuidanceRule()).item() < 1e-8
-    assert denoising_loss(PerfectDenoiser(), SCHEDULE, actions, actions + 0.1).item() > 1e-3
+    assert denoising_loss(PerfectDenoiser(), SCHEDULE, actions, actions)[0].item() < 1e-8
+    assert denoising_loss(PerfectDenoiser(), SCHEDULE, actions, actions, None, GuidanceRule())[0].item() < 1e-8
+    assert denoising_loss(PerfectDenoiser(), SCHEDULE, actions, actions + 0.1)[0].item() > 1e-3
 
 
 def test_the_noise_is_standard_normal_and_every_step_is_drawn():
@@ -89,7 +89,7 @@ def test_the_noise_is_standard_normal_and_every_step_is_drawn():
 def test_guidance_shifts_the_target(scale):
     th.manual_seed(0)
     actions, denoiser = th.rand(64, 2) * 2 - 1, PerfectDenoiser()
-    loss = denoising_loss(denoiser, SCHEDULE, actions, actions, pull, GuidanceRule("score", scale=scale))
+    loss = denoising_loss(denoiser, SCHEDULE, actions, actions, pull, GuidanceRule("score", scale=scale))[0]
     scales = th.tensor(scale)[denoiser.step] if isinstance(scale, list) else th.full((64,), scale)
     shift = (scales * (1.0 - SCHEDULE.alpha_bar[denoiser.step]).sqrt()).unsqueeze(1) * th.tensor([2.0, -3.0])
     assert loss.item() == pytest.approx(shift.square().mean().item(), rel=1e-4)
@@ -105,7 +105,7 @@ def test_guidance_shifts_the_target_towards_higher_density():
             [2.0, -3.0]
         )
 
-    assert denoising_loss(shifted_denoiser, SCHEDULE, actions, actions, pull, GuidanceRule("score")).item() < 1e-8
+    assert denoising_loss(shifted_denoiser, SCHEDULE, actions, actions, pull, GuidanceRule("score"))[0].item() < 1e-8
 
 
 def test_no_gradient_flows_through_the_guidance():
@@ -122,7 +122,7 @@ def test_no_gradient_flows_through_the_guidance():
 
     th.manual_seed(0)
     actions = th.rand(64, 2) * 2 - 1
-    denoising_loss(denoiser, SCHEDULE, actions, actions, guidance, GuidanceRule("score")).backward()
+    denoising_loss(denoiser, SCHEDULE, actions, actions, guidance, GuidanceRule("score"))[0].backward()
     alpha_bar = SCHEDULE.alpha_bar[seen["step"]].unsqueeze(1)
     noise = (seen["noisy"] - alpha_bar.sqrt() * actions) / (1.0 - alpha_bar).sqrt()
     target = noise - (1.0 - alpha_bar).sqrt() * (2.0 - seen["clean"])

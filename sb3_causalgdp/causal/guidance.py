@@ -63,7 +63,7 @@ class ReturnTarget:
 
     def __call__(self, response: ActionResponse) -> OutcomeTerm:
         _, by_state = self.value_gradient(response.next_state)
-        through_value = th.einsum("bj,bji->bi", by_state, response.next_state_jacobian)
+        through_value = (by_state.unsqueeze(2) * response.next_state_jacobian).sum(dim=1)
         jacobian = (response.reward_jacobian + self.discount * through_value) / self.std
         return OutcomeTerm(th.ones_like(response.reward), jacobian)
 
@@ -107,14 +107,21 @@ class CausalGuidance:
         :param action: Clean actions, shape ``(batch, d)``
         :return: Gradient, shape ``(batch, d)``, and curvature, shape ``(batch, d, d)``
         """
-        response = self.world_model.action_response(self.state, action)
+        return self.at(self.world_model.action_response(self.state, action))
+
+    @th.no_grad()
+    def at(self, response: ActionResponse) -> tuple[th.Tensor, th.Tensor]:
+        """
+        :param response: What the world model predicts at the actions
+        :return: As for a call with these actions
+        """
         outcome = self.outcome(response)
         gradient = self.outcome_scale * outcome.error.unsqueeze(1) * outcome.jacobian
         curvature = self.outcome_scale * outcome.jacobian.unsqueeze(2) * outcome.jacobian.unsqueeze(1)
         if self.state_scale > 0.0:
             error = (self.next_state - response.next_state) / response.next_state_std
             jacobian = response.next_state_jacobian / response.next_state_std.unsqueeze(1)
-            gradient = gradient + self.state_scale * th.einsum("bj,bji->bi", error, jacobian)
+            gradient = gradient + self.state_scale * (error.unsqueeze(2) * jacobian).sum(dim=1)
             curvature = curvature + self.state_scale * (jacobian.mT @ jacobian)
         return gradient, curvature
 
@@ -127,11 +134,12 @@ class LinearisedGuidance:
 
     :param guidance: The guidance
     :param action: a_0, shape ``(batch, d)``
+    :param response: What the world model predicts at a_0, where that is known already
     """
 
-    def __init__(self, guidance: CausalGuidance, action: th.Tensor) -> None:
+    def __init__(self, guidance: CausalGuidance, action: th.Tensor, response: ActionResponse | None = None) -> None:
         self.action = action
-        self.gradient, self.curvature = guidance(action)
+        self.gradient, self.curvature = guidance(action) if response is None else guidance.at(response)
 
     def __call__(self, action: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """

@@ -23,6 +23,9 @@ class MaskedBlocks(nn.Module):
     :param depth: Number of hidden layers, at least 1
     """
 
+    # Up to here one batched product is faster than one large product and a transposition
+    FEW_INPUTS = 64
+
     def __init__(self, n_inputs: int, n_outputs: int, width: int, depth: int) -> None:
         super().__init__()
         self.n_outputs = n_outputs
@@ -39,14 +42,26 @@ class MaskedBlocks(nn.Module):
         self.output_bias = nn.Parameter(th.zeros(n_outputs))
 
     def _masked_input_weight(self, mask: th.Tensor) -> th.Tensor:
-        return self.input_layer.weight * mask.repeat_interleave(self.width, dim=0)
+        """Shape ``(m, w, p)``."""
+        return self.input_layer.weight.view(self.n_outputs, self.width, -1) * mask.unsqueeze(1)
 
-    def _after_input_layer(self, hidden: th.Tensor) -> th.Tensor:
-        # Smooth, as a Jacobian has to be, and cheaper than GELU or SiLU
-        hidden = th.tanh(hidden).view(-1, self.n_outputs, self.width).transpose(0, 1)
-        for weight, bias in zip(self.hidden_weights, self.hidden_biases, strict=True):
-            hidden = th.tanh(th.baddbmm(bias, hidden, weight))
-        return th.einsum("jbw,jw->bj", hidden, self.output_weight) + self.output_bias
+    def _first_layer(self, inputs: th.Tensor, weight: th.Tensor) -> th.Tensor:
+        bias = self.input_layer.bias
+        if inputs.shape[1] <= self.FEW_INPUTS:
+            return th.baddbmm(bias.view(self.n_outputs, 1, self.width), inputs.expand(self.n_outputs, -1, -1), weight.mT)
+        hidden = F.linear(inputs, weight.flatten(0, 1), bias)
+        return hidden.view(-1, self.n_outputs, self.width).transpose(0, 1).contiguous()
+
+    def _hidden_layers(self, inputs: th.Tensor, weight: th.Tensor) -> list[th.Tensor]:
+        """Each of shape ``(m, batch, w)``: in this order, no product of the forward and backward pass needs a copy."""
+        # tanh is smooth, as a Jacobian has to be, and cheaper than GELU or SiLU
+        layers = [th.tanh(self._first_layer(inputs, weight))]
+        for hidden_weight, bias in zip(self.hidden_weights, self.hidden_biases, strict=True):
+            layers.append(th.tanh(th.baddbmm(bias, layers[-1], hidden_weight)))
+        return layers
+
+    def _outputs(self, hidden: th.Tensor) -> th.Tensor:
+        return th.baddbmm(self.output_bias.view(-1, 1, 1), hidden, self.output_weight.unsqueeze(2)).squeeze(2).t()
 
     def forward(self, inputs: th.Tensor, mask: th.Tensor) -> th.Tensor:
         """
@@ -54,8 +69,9 @@ class MaskedBlocks(nn.Module):
         :param mask: Shape ``(m, p)``
         :return: Shape ``(batch, m)``
         """
-        return self._after_input_layer(F.linear(inputs, self._masked_input_weight(mask), self.input_layer.bias))
+        return self._outputs(self._hidden_layers(inputs, self._masked_input_weight(mask))[-1])
 
+    @th.no_grad()
     def forward_and_jacobian(self, inputs: th.Tensor, mask: th.Tensor, columns: slice) -> tuple[th.Tensor, th.Tensor]:
         """
         :param inputs: Shape ``(batch, p)``
@@ -63,15 +79,18 @@ class MaskedBlocks(nn.Module):
         :param columns: The inputs by which to differentiate, q of them
         :return: The outputs, shape ``(batch, m)``, and their Jacobian, shape ``(batch, m, q)``, both without a graph
         """
-        with th.enable_grad():
-            weight = self._masked_input_weight(mask).detach()
-            hidden = F.linear(inputs, weight, self.input_layer.bias).detach().requires_grad_()
-            outputs = self._after_input_layer(hidden)
-            # Each hidden unit belongs to one output: the gradient of the sum is the gradient of its own output
-            (gradient,) = th.autograd.grad(outputs.sum(), hidden)
-        gradient = gradient.view(-1, self.n_outputs, self.width)
-        weight = weight.view(self.n_outputs, self.width, -1)[:, :, columns]
-        return outputs.detach(), th.einsum("bjw,jwi->bji", gradient, weight)
+        weight = self._masked_input_weight(mask)
+        layers = self._hidden_layers(inputs, weight)
+        # Each hidden unit belongs to one output: back-propagating all outputs at once keeps their derivatives apart
+        gradient = _through_tanh(self.output_weight.unsqueeze(1), layers[-1])
+        for hidden_weight, hidden in zip(reversed(list(self.hidden_weights)), reversed(layers[:-1]), strict=True):
+            gradient = _through_tanh(th.bmm(gradient, hidden_weight.mT), hidden)
+        return self._outputs(layers[-1]), th.bmm(gradient, weight[:, :, columns]).transpose(0, 1)
+
+
+def _through_tanh(gradient: th.Tensor, output: th.Tensor) -> th.Tensor:
+    """``gradient (1 - output^2)`` in one pass over the memory."""
+    return th.ops.aten.tanh_backward(gradient, output)
 
 
 class ActionResponse(NamedTuple):
@@ -306,7 +325,7 @@ class MaskedWorldModel(nn.Module):
         reward_gradient = reward_gradient.squeeze(1)
         by_next_state, by_action = reward_gradient[:, : self.state_dim], reward_gradient[:, self.state_dim :]
         by_next_state = by_next_state * (next_standardised.abs() <= self.INPUT_BOUND)
-        total = by_action + th.einsum("bj,bji->bi", by_next_state, next_jacobian)
+        total = by_action + (by_next_state.unsqueeze(2) * next_jacobian).sum(dim=1)
         return ActionResponse(
             next_state=self.state_mean + state_std * next_standardised,
             next_state_std=self._bounded(self.transition_log_std).exp() * residual_std * state_std,

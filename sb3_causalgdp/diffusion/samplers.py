@@ -57,6 +57,23 @@ def transition_std(schedule: NoiseSchedule, step: int) -> float:
     return math.sqrt((1.0 - previous) / (1.0 - current) * schedule.beta_list[step])
 
 
+def transition_weights(schedule: NoiseSchedule, step: int, eta: float = 1.0) -> tuple[float, float, float]:
+    """
+    A reverse step is ``a^(k-1) = by_clean a0_hat + by_noisy a^k + std z`` (Song et al., 2021, DDIM, equation 12).
+
+    :param schedule: Noise schedule
+    :param step: Index of the diffusion step, ``0..K-1``; step 0 returns the clean action, ``(1, 0, 0)``
+    :param eta: 1 is DDPM's ancestral step, 0 is deterministic
+    :return: ``by_clean``, ``by_noisy`` and ``std``
+    """
+    if step == 0:
+        return 1.0, 0.0, 0.0
+    alpha_bar, previous = schedule.alpha_bar_list[step], schedule.alpha_bar_previous_list[step]
+    std = eta * transition_std(schedule, step)
+    by_noisy = math.sqrt(1.0 - previous - std**2) / math.sqrt(1.0 - alpha_bar)
+    return math.sqrt(previous) - by_noisy * math.sqrt(alpha_bar), by_noisy, std
+
+
 def denoising_step(
     schedule: NoiseSchedule,
     step: int,
@@ -78,10 +95,8 @@ def denoising_step(
     """
     if step == 0:
         return clean_action
-    alpha_bar, previous = schedule.alpha_bar_list[step], schedule.alpha_bar_previous_list[step]
-    std = eta * transition_std(schedule, step)
-    direction = math.sqrt(1.0 - previous - std**2) / math.sqrt(1.0 - alpha_bar)
-    mean = (math.sqrt(previous) - direction * math.sqrt(alpha_bar)) * clean_action + direction * noisy_action
+    by_clean, by_noisy, std = transition_weights(schedule, step, eta)
+    mean = by_clean * clean_action + by_noisy * noisy_action
     return mean + std * noise if std > 0.0 else mean
 
 

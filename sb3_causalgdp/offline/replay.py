@@ -37,6 +37,26 @@ def _concatenate(parts: Sequence[Any]) -> Any:
     return None if parts[0] is None else th.cat(list(parts))
 
 
+def split_sample(sample: Any, n_parts: int) -> list[Any]:
+    """
+    Split one large sample into batches, each with its share of every kind of row: a HER sample, or one of several buffers, has
+    its kinds one behind the other, so that a batch takes every ``n_parts``-th row.
+
+    :param sample: Sample of a replay buffer
+    :param n_parts: Number of batches
+    :return: The batches; views, no copies
+    """
+    if n_parts == 1:
+        return [sample]
+    return [type(sample)(*(_every(part, first, n_parts) for part in sample)) for first in range(n_parts)]
+
+
+def _every(part: Any, first: int, step: int) -> Any:
+    if isinstance(part, dict):
+        return {key: values[first::step] for key, values in part.items()}
+    return None if part is None else part[first::step]
+
+
 class SpacesEnv(VecEnv):
     """
     Stands where SB3 wants an environment and only its spaces are known; it cannot be stepped.

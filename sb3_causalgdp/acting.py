@@ -1,0 +1,369 @@
+"""
+Prediction for few observations, in numpy.
+
+For a handful of rows, nearly all of the time that PyTorch needs goes into dispatching hundreds of small operations. Here the
+same numbers are computed on the same memory: the arrays are views of the networks' weights, so nothing is copied and nothing
+gets out of date while they are trained. What is not covered is left to the plain path, see :meth:`NumpyActing.covers`.
+"""
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.torch_layers import FlattenExtractor
+from torch import nn
+
+from sb3_causalgdp.causal.world_model import MaskedBlocks, MaskedWorldModel
+from sb3_causalgdp.diffusion import MLPDenoiser
+from sb3_causalgdp.diffusion.samplers import transition_weights
+
+if TYPE_CHECKING:
+    from sb3_causalgdp.policies import CausalGDPPolicy
+
+
+class Activation(NamedTuple):
+    """An activation and its derivative, the latter from the input and the output."""
+
+    value: Callable[[np.ndarray], np.ndarray]
+    derivative: Callable[[np.ndarray, np.ndarray], np.ndarray]
+
+
+def _sigmoid(x: np.ndarray) -> np.ndarray:
+    # By tanh, which does not overflow
+    return 0.5 * (1.0 + np.tanh(0.5 * x))
+
+
+def _tanh_of_softplus(x: np.ndarray) -> np.ndarray:
+    # tanh(log(1 + e)) = ((1 + e)^2 - 1) / ((1 + e)^2 + 1): one exponential; beyond 20 it is 1 in float32
+    exponential = np.exp(np.minimum(x, 20.0))
+    numerator = exponential * (exponential + 2.0)
+    return numerator / (numerator + 2.0)
+
+
+def _mish_derivative(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    squashed = _tanh_of_softplus(x)
+    return squashed + x * _sigmoid(x) * (1.0 - squashed * squashed)
+
+
+def _silu_derivative(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    gate = _sigmoid(x)
+    return gate + y * (1.0 - gate)
+
+
+ACTIVATIONS: dict[type[nn.Module], Activation] = {
+    nn.ReLU: Activation(lambda x: np.maximum(x, 0.0), lambda x, y: (y > 0.0).astype(y.dtype)),
+    nn.Tanh: Activation(np.tanh, lambda x, y: 1.0 - y * y),
+    nn.Mish: Activation(lambda x: x * _tanh_of_softplus(x), _mish_derivative),
+    nn.SiLU: Activation(lambda x: x * _sigmoid(x), _silu_derivative),
+}
+
+
+def _clip(action: np.ndarray) -> np.ndarray:
+    # A third of the time of np.clip on a few numbers
+    return np.minimum(np.maximum(action, -1.0), 1.0)
+
+
+Layer = tuple[np.ndarray, np.ndarray]
+
+
+def _view(tensor: th.Tensor) -> np.ndarray:
+    return tensor.detach().numpy()
+
+
+def _linear_layers(modules: Any, activation: type[nn.Module]) -> list[Layer] | None:
+    """Weights, transposed, and biases of layers with that activation between them; None if there is anything else."""
+    layers = []
+    for module in modules:
+        if isinstance(module, nn.Linear) and module.bias is not None:
+            layers.append((_view(module.weight).T, _view(module.bias)))
+        elif type(module) is not activation:
+            return None
+    return layers
+
+
+class _Denoiser:
+    """The denoiser and the noise-schedule's coefficients of each reverse step."""
+
+    def __init__(self, policy: "CausalGDPPolicy") -> None:
+        actor, denoiser = policy.actor, policy.actor.denoiser
+        weight = _view(denoiser.input_layer.weight).T
+        first_time = denoiser.action_dim
+        first_condition = first_time + denoiser.time_table.shape[1]
+        self.action_weight, self.condition_weight = weight[:first_time], weight[first_condition:]
+        self.time_weight, self.bias = weight[first_time:first_condition], _view(denoiser.input_layer.bias)
+        self.time_table = _view(denoiser.time_table)
+        time_layers = _linear_layers(denoiser.time_mlp, nn.Mish)
+        layers = _linear_layers(denoiser.network, actor.activation_fn)
+        assert time_layers is not None and layers is not None
+        self.time_layers, self.layers = time_layers, layers
+        self.activation = ACTIVATIONS[actor.activation_fn].value
+        self.schedule = actor.schedule
+        eta = 1.0 if actor.sampler == "ddpm" else actor.ddim_eta
+        self.weights = [transition_weights(actor.schedule, step, eta) for step in range(actor.schedule.n_steps)]
+
+    def bind(self, features: np.ndarray) -> list[np.ndarray]:
+        """The first layer without the noisy action's part, for each diffusion step."""
+        (weight, bias), (last_weight, last_bias) = self.time_layers
+        embedding = ACTIVATIONS[nn.Mish].value(self.time_table @ weight + bias) @ last_weight + last_bias
+        from_time = embedding @ self.time_weight
+        from_condition = features @ self.condition_weight + self.bias
+        return [from_condition + from_time[step] for step in range(len(from_time))]
+
+    def predict_noise(self, noisy_action: np.ndarray, from_rest: np.ndarray) -> np.ndarray:
+        hidden = noisy_action @ self.action_weight
+        hidden += from_rest
+        for weight, bias in self.layers:
+            hidden = self.activation(hidden) @ weight
+            hidden += bias
+        return hidden
+
+    def sample(
+        self, bound: list[np.ndarray], noise: np.ndarray, shift: Callable[[np.ndarray, int], np.ndarray] | None = None
+    ) -> np.ndarray:
+        """The chain of :func:`sb3_causalgdp.diffusion.sample`."""
+        action, n_steps = noise[0], len(noise)
+        for position, step in enumerate(reversed(range(n_steps))):
+            alpha_bar = self.schedule.alpha_bar_list[step]
+            spread, signal = (1.0 - alpha_bar) ** 0.5, alpha_bar**0.5
+            clean = (action - spread * self.predict_noise(action, bound[step])) / signal
+            if shift is not None:
+                clean = clean + (spread / signal) * shift(_clip(clean), step)
+            clean = _clip(clean)
+            by_clean, by_noisy, std = self.weights[step]
+            action = by_clean * clean + by_noisy * action if step > 0 else clean
+            if step > 0 and std > 0.0:
+                action += std * noise[min(position + 1, n_steps - 1)]
+        return action
+
+
+class _Critics:
+    """The target critics: the smallest Q, and its gradient by the state."""
+
+    def __init__(self, policy: "CausalGDPPolicy") -> None:
+        self.networks = []
+        for network in policy.critic_target.q_networks:
+            layers = _linear_layers(network, policy.activation_fn)
+            assert layers is not None
+            self.networks.append(layers)
+        self.activation = ACTIVATIONS[policy.activation_fn]
+
+    def values(self, features: np.ndarray, actions: np.ndarray, n_candidates: int) -> np.ndarray:
+        """Smallest Q of several actions for each row of features; the features' part of the first layer is computed once."""
+        smallest = None
+        for (weight, bias), *layers in self.networks:
+            hidden = np.repeat(features @ weight[: features.shape[1]] + bias, n_candidates, axis=0)
+            hidden += actions @ weight[features.shape[1] :]
+            for next_weight, next_bias in layers:
+                hidden = self.activation.value(hidden) @ next_weight
+                hidden += next_bias
+            smallest = hidden if smallest is None else np.minimum(smallest, hidden)
+        assert smallest is not None
+        return smallest[:, 0]
+
+    def gradient(self, state: np.ndarray, action: np.ndarray) -> np.ndarray:
+        """Of the smallest Q, by the state, shape ``(batch, n)``."""
+        inputs = np.concatenate([state, action], axis=1)
+        values, gradients = zip(*(self._value_and_gradient(layers, inputs) for layers in self.networks), strict=True)
+        smallest = np.argmin(np.concatenate(values, axis=1), axis=1)
+        return np.stack(gradients)[smallest, np.arange(len(state)), : state.shape[1]]
+
+    def _value_and_gradient(
+        self, layers: list[tuple[np.ndarray, np.ndarray]], hidden: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        derivatives = []
+        for weight, bias in layers[:-1]:
+            before = hidden @ weight + bias
+            hidden = self.activation.value(before)
+            derivatives.append(self.activation.derivative(before, hidden))
+        weight, bias = layers[-1]
+        gradient = np.broadcast_to(weight.T, hidden.shape)
+        for (earlier_weight, _), derivative in zip(reversed(layers[:-1]), reversed(derivatives), strict=True):
+            gradient = (gradient * derivative) @ earlier_weight.T
+        return hidden @ weight + bias, gradient
+
+
+class _Blocks:
+    """``MaskedBlocks``, whose inputs are masked here, and not its weights, of which there are more."""
+
+    def __init__(self, blocks: MaskedBlocks) -> None:
+        shape = (blocks.n_outputs, blocks.width)
+        self.weight = _view(blocks.input_layer.weight).reshape(*shape, -1)
+        self.bias = _view(blocks.input_layer.bias).reshape(blocks.n_outputs, 1, blocks.width)
+        self.hidden = [
+            (_view(weight), _view(bias)) for weight, bias in zip(blocks.hidden_weights, blocks.hidden_biases, strict=True)
+        ]
+        self.output_weight, self.output_bias = _view(blocks.output_weight), _view(blocks.output_bias)
+
+    def forward_and_jacobian(self, inputs: np.ndarray, mask: np.ndarray, first: int) -> tuple[np.ndarray, np.ndarray]:
+        """Outputs, shape ``(batch, m)``, and their Jacobian by the inputs from the first on, shape ``(m, batch, q)``."""
+        layers = [np.tanh((inputs * mask[:, None]) @ self.weight.transpose(0, 2, 1) + self.bias)]
+        for weight, bias in self.hidden:
+            layers.append(np.tanh(layers[-1] @ weight + bias))
+        outputs = (layers[-1] @ self.output_weight[:, :, None])[:, :, 0].T + self.output_bias
+        gradient = self.output_weight[:, None] * (1.0 - layers[-1] * layers[-1])
+        for (weight, _), hidden in zip(reversed(self.hidden), reversed(layers[:-1]), strict=True):
+            gradient = (gradient @ weight.transpose(0, 2, 1)) * (1.0 - hidden * hidden)
+        return outputs, (gradient @ self.weight[:, :, first:]) * mask[:, None, first:]
+
+
+class _WorldModel:
+    """:meth:`~sb3_causalgdp.causal.MaskedWorldModel.action_response`, with Jacobians of shape ``(n, batch, d)``."""
+
+    def __init__(self, model: MaskedWorldModel) -> None:
+        self.model = model
+        self.transition, self.reward = _Blocks(model.transition), _Blocks(model.reward)
+        self.arrays = {
+            name: _view(value) for name, value in (*model.named_buffers(recurse=False), *model.named_parameters(recurse=False))
+        }
+
+    def response(self, state: np.ndarray, action: np.ndarray) -> dict[str, np.ndarray]:
+        arrays, bound = self.arrays, self.model.INPUT_BOUND
+        n_states = state.shape[1]
+        state_std = np.maximum(np.sqrt(arrays["state_variance"]), 1e-4)
+        reward_scale = np.maximum(np.sqrt(arrays["reward_variance"]), 1e-4)
+        gate = arrays["state_to_state"].diagonal()
+        change = np.minimum(arrays["change_variance"] / (state_std * state_std), 4.0)
+        residual_std = np.maximum(np.sqrt((1.0 - gate) ** 2 + gate * change), 1e-4)
+        standardised = (state - arrays["state_mean"]) / state_std
+        inputs = np.concatenate([np.clip(standardised, -bound, bound), action], axis=1)
+        mask = np.concatenate([arrays["state_to_state"], arrays["action_to_state"]], axis=1)
+        change, jacobian = self.transition.forward_and_jacobian(inputs, mask, n_states)
+        next_standardised = gate * standardised + residual_std * change
+        next_jacobian = residual_std[:, None, None] * jacobian
+        reward_inputs = np.concatenate([np.clip(next_standardised, -bound, bound), action], axis=1)
+        reward_mask = np.concatenate([arrays["state_to_reward"], arrays["action_to_reward"]])[None]
+        reward, reward_gradient = self.reward.forward_and_jacobian(reward_inputs, reward_mask, 0)
+        by_next_state = reward_gradient[0, :, :n_states] * (np.abs(next_standardised) <= bound)
+        total = reward_gradient[0, :, n_states:] + np.einsum("bj,jbi->bi", by_next_state, next_jacobian)
+        lowest, highest = self.model.LOG_STD_BOUNDS
+        return {
+            "next_state": arrays["state_mean"] + state_std * next_standardised,
+            "next_state_std": np.exp(np.clip(arrays["transition_log_std"], lowest, highest)) * residual_std * state_std,
+            "next_state_jacobian": state_std[:, None, None] * next_jacobian,
+            "reward": arrays["reward_mean"] + reward_scale * reward[:, 0],
+            "reward_std": np.exp(np.clip(arrays["reward_log_std"], lowest, highest)) * reward_scale,
+            "reward_jacobian": reward_scale * total,
+        }
+
+
+class NumpyActing:
+    """
+    What :meth:`CausalGDPPolicy._act` computes, for few rows on a CPU.
+
+    :param policy: A policy that :meth:`covers` accepts
+    """
+
+    # Rows of candidates up to which this is faster than PyTorch, see benchmarks/speed
+    MOST_ROWS = 128
+
+    def __init__(self, policy: "CausalGDPPolicy") -> None:
+        self.denoiser = _Denoiser(policy)
+        self.critics = _Critics(policy)
+        self.world_model = _WorldModel(policy.world_model)
+        self.rule = policy.guidance_rule
+        self._modules = self._modules_of(policy)
+        self._tensors = [tensor for module in self._modules for tensor in (*module.parameters(), *module.buffers())]
+        self._addresses = [tensor.data_ptr() for tensor in self._tensors]
+
+    @staticmethod
+    def _modules_of(policy: "CausalGDPPolicy") -> tuple[nn.Module, ...]:
+        return policy.actor.denoiser, policy.critic_target, policy.world_model
+
+    def __reduce__(self) -> tuple[type, tuple]:
+        # Views are of one process and one policy: copies and pickles of the policy make their own
+        return type(None), ()
+
+    def is_current(self, policy: "CausalGDPPolicy") -> bool:
+        """
+        :param policy: The policy
+        :return: Whether the views are still those of its networks, which may have been moved or replaced
+        """
+        same = all(ours is theirs for ours, theirs in zip(self._modules, self._modules_of(policy), strict=True))
+        return same and [tensor.data_ptr() for tensor in self._tensors] == self._addresses
+
+    @staticmethod
+    def covers(policy: "CausalGDPPolicy") -> bool:
+        """
+        :param policy: A policy
+        :return: Whether this class can act for it: vectors of observations as they are, plain layers in float32 on a CPU, and
+            a guidance without the denoiser's Jacobian
+        """
+        rule, activation = policy.guidance_rule, policy.activation_fn
+        networks: list[Any] = [policy.actor.denoiser.network, *policy.critic_target.q_networks]
+        return (
+            policy.device.type == "cpu"
+            and type(policy.observation_space) is spaces.Box
+            and not policy.has_image_state
+            and type(policy.actor.features_extractor) is FlattenExtractor
+            and type(policy.critic_target.features_extractor) is FlattenExtractor
+            and type(policy.actor.denoiser) is MLPDenoiser
+            and activation in ACTIVATIONS
+            and all(_linear_layers(network, activation) is not None for network in networks)
+            and all(parameter.dtype == th.float32 for parameter in policy.parameters())
+            and (rule is None or not rule.needs_jacobian)
+        )
+
+    def __call__(self, policy: "CausalGDPPolicy", features: np.ndarray, noise: np.ndarray, guided: bool) -> np.ndarray:
+        """
+        :param policy: The policy, for its settings
+        :param features: The observations, float32, shape ``(batch, n)``
+        :param noise: Noise of the candidates, shape ``(K, batch * n_action_candidates, d)``
+        :param guided: Whether the guidance is on
+        :return: Actions in [-1, 1], shape ``(batch, d)``
+        """
+        n_candidates = policy.n_action_candidates
+        bound = self.denoiser.bind(features)
+        repeated = bound if n_candidates == 1 else [np.repeat(part, n_candidates, axis=0) for part in bound]
+        candidates = self.denoiser.sample(repeated, noise)
+        best = np.arange(0, len(candidates), n_candidates)
+        if n_candidates > 1:
+            values = self.critics.values(features, candidates, n_candidates)
+            best = best + values.reshape(-1, n_candidates).argmax(axis=1)
+        action = candidates[best]
+        if not guided:
+            return action
+        gradient, curvature = self._local_model(policy, features, action)
+        assert self.rule is not None
+        rule, alpha_bar = self.rule, policy.actor.schedule.alpha_bar_list
+        identity = np.eye(action.shape[1], dtype=action.dtype)
+
+        def shift(clean: np.ndarray, step: int) -> np.ndarray:
+            direction = gradient - (curvature @ (clean - action)[:, :, None])[:, :, 0]
+            if rule.mode == "normalized":
+                direction = direction / np.maximum(np.linalg.norm(direction, axis=1, keepdims=True), 1e-8)
+            elif rule.mode == "posterior":
+                system = identity + (1.0 - alpha_bar[step]) * curvature
+                size = np.abs(system).max(axis=(1, 2), keepdims=True)
+                system = system + 8.0 * np.finfo(system.dtype).eps * size * identity
+                direction = alpha_bar[step] ** 0.5 * np.linalg.solve(system, direction[:, :, None])[:, :, 0]
+            scale = rule.scales[step] if len(rule.scales) > 1 else rule.scales[0]
+            return scale * (1.0 - alpha_bar[step]) ** 0.5 * direction
+
+        return self.denoiser.sample(bound, noise[:, best], shift)
+
+    def _local_model(self, policy: "CausalGDPPolicy", state: np.ndarray, action: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Gradient and curvature of the guidance at the best candidate, whose predicted state is the one to reach."""
+        response = self.world_model.response(state, action)
+        if policy.guidance_target == "return":
+            error = np.ones(len(state), dtype=state.dtype)
+            jacobian = response["reward_jacobian"] + policy.discount * self._value_jacobian(policy, response, action)
+            jacobian = jacobian / _view(policy.return_std)
+        else:
+            error = (_view(policy.reward_target) - response["reward"]) / response["reward_std"]
+            jacobian = response["reward_jacobian"] / response["reward_std"]
+        scale = np.float32(policy.outcome_guidance_scale)
+        gradient = scale * error[:, None] * jacobian
+        curvature = scale * jacobian[:, :, None] * jacobian[:, None, :]
+        if policy.state_guidance_scale > 0.0:
+            by_state = (response["next_state_jacobian"] / response["next_state_std"][:, None, None]).transpose(1, 0, 2)
+            curvature = curvature + np.float32(policy.state_guidance_scale) * (by_state.transpose(0, 2, 1) @ by_state)
+        return gradient, curvature
+
+    def _value_jacobian(self, policy: "CausalGDPPolicy", response: dict[str, np.ndarray], action: np.ndarray) -> np.ndarray:
+        next_state = response["next_state"]
+        noise = np.zeros((policy.actor.schedule.n_steps, *action.shape), dtype=action.dtype)
+        next_action = self.denoiser.sample(self.denoiser.bind(next_state), noise)
+        by_state = self.critics.gradient(next_state, next_action)
+        return np.einsum("bj,jbi->bi", by_state, response["next_state_jacobian"])

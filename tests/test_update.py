@@ -1,0 +1,175 @@
+"""The fast parts of an update do what the plain ones do."""
+
+import numpy as np
+import pytest
+import torch as th
+from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.type_aliases import ReplayBufferSamples
+
+from sb3_causalgdp import CausalGDP
+from sb3_causalgdp.offline.replay import split_sample
+from sb3_causalgdp.policies import q_values
+
+KWARGS = {
+    "policy_kwargs": {"net_arch": [16, 16], "world_model_net_arch": [8, 8]},
+    "learning_starts": 210,
+    "causal_refresh_freq": 205,
+    "batch_size": 32,
+    "seed": 0,
+}
+
+
+def trained_model(**kwargs):
+    """A model whose guidance is on, just before its next gradient step."""
+    model = CausalGDP("MlpPolicy", "Pendulum-v1", **{**KWARGS, **kwargs})
+    model.learn(215)
+    assert model.policy.is_guided
+    model.policy.set_training_mode(True)
+    return model
+
+
+# The action that the Q term judges --------------------------------------------------------------------------------------
+
+
+def q_term_and_its_noise(model, data):
+    """The Q term, and the action that the denoising term's own noise prediction gives."""
+    actor, actions = model.actor, data.actions
+    th.manual_seed(5)
+    _, q_term = model._actor_losses(data, actions, climbed=0, guided=False)
+    th.manual_seed(5)
+    step = th.randint(actor.schedule.n_steps, (len(actions),))
+    noise = th.randn_like(actions)
+    alpha_bar = actor.schedule.alpha_bar[step].unsqueeze(1)
+    noisy = alpha_bar.sqrt() * actions + (1.0 - alpha_bar).sqrt() * noise
+    predicted = actor.denoiser(noisy, step, actor.features(data.observations))
+    clean = (noisy - (1.0 - alpha_bar).sqrt() * predicted) / alpha_bar.sqrt()
+    return q_term, clean.clamp(-1.0, 1.0)
+
+
+def test_one_step_judges_the_clean_estimate_of_the_denoising_term():
+    model = trained_model(actor_update="one_step")
+    data = model.replay_buffer.sample(64)
+    q_term, clean = q_term_and_its_noise(model, data)
+    first, second = q_values(
+        model.critic, model.critic.extract_features(data.observations, model.critic.features_extractor), clean
+    )
+    expected = -first.mean() / second.detach().abs().mean()
+    th.testing.assert_close(q_term, expected, rtol=1e-5, atol=1e-6)
+    ours = th.autograd.grad(q_term, list(model.actor.parameters()))
+    for gradient, plain in zip(ours, th.autograd.grad(expected, list(model.actor.parameters())), strict=True):
+        th.testing.assert_close(gradient, plain, rtol=1e-4, atol=1e-6)
+
+
+def test_the_chain_judges_where_the_chain_ends():
+    model = trained_model(actor_update="chain")
+    data = model.replay_buffer.sample(64)
+    q_term, clean = q_term_and_its_noise(model, data)
+    one_step = -q_values(model.critic, data.observations.float(), clean)[0].mean()
+    assert not th.isclose(q_term, one_step, rtol=1e-3)
+    th.manual_seed(5)
+    th.randint(model.actor.schedule.n_steps, (64,)), th.randn_like(data.actions)
+    first, second = model.critic(data.observations, model.actor.sample(model.actor.features(data.observations)))
+    th.testing.assert_close(q_term, -first.mean() / second.detach().abs().mean(), rtol=1e-5, atol=1e-6)
+
+
+def test_an_unknown_actor_update_is_refused():
+    with pytest.raises(ValueError, match="Unknown actor_update"):
+        CausalGDP("MlpPolicy", "Pendulum-v1", actor_update="two_step")
+
+
+# Sampling ---------------------------------------------------------------------------------------------------------------
+
+
+def test_a_sample_is_split_into_batches_with_a_share_of_every_kind_of_row():
+    rows = th.arange(12.0).unsqueeze(1)
+    sample = ReplayBufferSamples({"a": rows}, rows + 100, {"a": rows}, rows, rows, None)
+    batches = split_sample(sample, 3)
+    assert [batch.observations["a"].flatten().tolist() for batch in batches] == [[0, 3, 6, 9], [1, 4, 7, 10], [2, 5, 8, 11]]
+    assert th.equal(batches[2].actions, batches[2].observations["a"] + 100)
+    assert batches[0].discounts is None
+    assert split_sample(sample, 1)[0] is sample
+
+
+def test_many_gradient_steps_sample_the_buffer_once(monkeypatch):
+    model = trained_model()
+    sizes = []
+    original = model.replay_buffer.sample
+    monkeypatch.setattr(model.replay_buffer, "sample", lambda size, env=None: sizes.append(size) or original(size, env))
+    model.train(gradient_steps=5, batch_size=32)
+    assert sizes == [160]
+    monkeypatch.setattr(CausalGDP, "MOST_ROWS_PER_DRAW", 64)
+    model.train(gradient_steps=5, batch_size=32)
+    assert sizes[1:] == [64, 64, 32]
+
+
+def test_every_gradient_step_of_a_draw_has_its_own_rows(monkeypatch):
+    model = trained_model()
+    seen = []
+    original = model._update_critics
+    monkeypatch.setattr(model, "_update_critics", lambda data: seen.append(data.actions.clone()) or original(data))
+    model.train(gradient_steps=4, batch_size=32)
+    assert [len(actions) for actions in seen] == [32] * 4
+    assert len(np.unique(th.cat(seen).numpy(), axis=0)) > 64
+
+
+def test_logs_are_means_over_the_gradient_steps(monkeypatch):
+    model = trained_model()
+    values = iter([1.0, 2.0, 6.0])
+    original = model._update_actor
+    monkeypatch.setattr(model, "_update_actor", lambda *args: {**original(*args), "q_loss": th.tensor(next(values))})
+    model.set_logger(Logger(None, []))
+    model.train(gradient_steps=3, batch_size=16)
+    assert model.logger.name_to_value["train/q_loss"] == pytest.approx(3.0)
+
+
+# Compilation ------------------------------------------------------------------------------------------------------------
+
+
+def weights_after(model, seed=3):
+    th.manual_seed(seed), np.random.seed(seed)
+    model.train(gradient_steps=3, batch_size=32)
+    return model.policy.state_dict()
+
+
+def test_compiled_losses_train_as_the_plain_ones_do(tmp_path, monkeypatch):
+    model = trained_model()
+    model.save(tmp_path / "model")
+    model.save_replay_buffer(tmp_path / "buffer")
+    compile_ = th.compile
+    # The captured graphs and their derivatives, without a minute of C++
+    monkeypatch.setattr(th, "compile", lambda function, mode: compile_(function, backend="aot_eager"))
+    states = []
+    for compiled in (False, True):
+        loaded = CausalGDP.load(tmp_path / "model", custom_objects={"compile": compiled})
+        loaded.load_replay_buffer(tmp_path / "buffer")
+        loaded.set_logger(Logger(None, []))
+        states.append(weights_after(loaded))
+    for name, value in states[0].items():
+        th.testing.assert_close(states[1][name], value, rtol=1e-5, atol=1e-6, msg=name)
+    loaded.save(tmp_path / "again")
+    assert CausalGDP.load(tmp_path / "again").compile is True
+
+
+# Threads ----------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("torch_threads", "expected"), [("auto", 1), (2, 2), (None, 3)])
+def test_updates_run_with_the_threads_asked_for_and_give_them_back(torch_threads, expected, monkeypatch):
+    model = trained_model(torch_threads=torch_threads)
+    seen = []
+    original = model._update_targets
+    monkeypatch.setattr(model, "_update_targets", lambda: seen.append(th.get_num_threads()) or original())
+    before = th.get_num_threads()
+    try:
+        th.set_num_threads(3)
+        model.train(gradient_steps=1, batch_size=8)
+        assert seen == [expected]
+        assert th.get_num_threads() == 3
+    finally:
+        th.set_num_threads(before)
+
+
+@pytest.mark.parametrize("torch_threads", [0, -1, True, "all", 1.5])
+def test_a_number_of_threads_that_is_none_is_refused(torch_threads):
+    with pytest.raises(ValueError, match="torch_threads"):
+        CausalGDP("MlpPolicy", "Pendulum-v1", torch_threads=torch_threads)
