@@ -22,6 +22,7 @@ from sb3_causalgdp.acting import NumpyActing
 from sb3_causalgdp.causal import CausalGuidance, LinearisedGuidance, MaskedWorldModel, ReturnTarget, RewardTarget
 from sb3_causalgdp.causal.guidance import OutcomeTarget
 from sb3_causalgdp.diffusion import Guidance, GuidanceRule, MLPDenoiser, NoiseSchedule, sample
+from sb3_causalgdp.diffusion.denoisers import in_place
 from sb3_causalgdp.diffusion.samplers import check_sampler
 
 ACTIVATIONS: dict[str, type[nn.Module]] = {
@@ -306,6 +307,7 @@ class CausalGDPPolicy(BasePolicy):
         self.actor_kwargs = {**shared_kwargs, "net_arch": actor_arch, **self.diffusion_kwargs}
         self.critic_kwargs = {
             **shared_kwargs,
+            "activation_fn": in_place(self.activation_fn),
             "net_arch": critic_arch,
             "n_critics": n_critics,
             "share_features_extractor": share_features_extractor,

@@ -55,9 +55,10 @@ class MaskedBlocks(nn.Module):
     def _hidden_layers(self, inputs: th.Tensor, weight: th.Tensor) -> list[th.Tensor]:
         """Each of shape ``(m, batch, w)``: in this order, no product of the forward and backward pass needs a copy."""
         # tanh is smooth, as a Jacobian has to be, and cheaper than GELU or SiLU
-        layers = [th.tanh(self._first_layer(inputs, weight))]
+        # In place: half of the memory, which then stays in the cache
+        layers = [self._first_layer(inputs, weight).tanh_()]
         for hidden_weight, bias in zip(self.hidden_weights, self.hidden_biases, strict=True):
-            layers.append(th.tanh(th.baddbmm(bias, layers[-1], hidden_weight)))
+            layers.append(th.baddbmm(bias, layers[-1], hidden_weight).tanh_())
         return layers
 
     def _outputs(self, hidden: th.Tensor) -> th.Tensor:
