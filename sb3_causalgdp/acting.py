@@ -7,7 +7,7 @@ gets out of date while they are trained. What is not covered is left to the plai
 """
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch as th
@@ -19,8 +19,7 @@ from sb3_causalgdp.causal.world_model import MaskedBlocks, MaskedWorldModel
 from sb3_causalgdp.diffusion import MLPDenoiser
 from sb3_causalgdp.diffusion.samplers import transition_weights
 
-if TYPE_CHECKING:
-    from sb3_causalgdp.policies import CausalGDPPolicy
+Policy = Any  # a CausalGDPPolicy, whose file imports this one
 
 
 class Activation(NamedTuple):
@@ -86,7 +85,7 @@ def _linear_layers(modules: Any, activation: type[nn.Module]) -> list[Layer] | N
 class _Denoiser:
     """The denoiser and the noise-schedule's coefficients of each reverse step."""
 
-    def __init__(self, policy: "CausalGDPPolicy") -> None:
+    def __init__(self, policy: Policy) -> None:
         actor, denoiser = policy.actor, policy.actor.denoiser
         weight = _view(denoiser.input_layer.weight).T
         first_time = denoiser.action_dim
@@ -141,7 +140,7 @@ class _Denoiser:
 class _Critics:
     """The target critics: the smallest Q, and its gradient by the state."""
 
-    def __init__(self, policy: "CausalGDPPolicy") -> None:
+    def __init__(self, policy: Policy) -> None:
         self.networks = []
         for network in policy.critic_target.q_networks:
             layers = _linear_layers(network, policy.activation_fn)
@@ -258,7 +257,7 @@ class NumpyActing:
     # Rows of candidates up to which this is faster than PyTorch, see benchmarks/speed
     MOST_ROWS = 640
 
-    def __init__(self, policy: "CausalGDPPolicy") -> None:
+    def __init__(self, policy: Policy) -> None:
         self.denoiser = _Denoiser(policy)
         self.critics = _Critics(policy)
         self.world_model = _WorldModel(policy.world_model)
@@ -268,14 +267,14 @@ class NumpyActing:
         self._addresses = [tensor.data_ptr() for tensor in self._tensors]
 
     @staticmethod
-    def _modules_of(policy: "CausalGDPPolicy") -> tuple[nn.Module, ...]:
+    def _modules_of(policy: Policy) -> tuple[nn.Module, ...]:
         return policy.actor.denoiser, policy.critic_target, policy.world_model
 
     def __reduce__(self) -> tuple[type, tuple]:
         # Views are of one process and one policy: copies and pickles of the policy make their own
         return type(None), ()
 
-    def is_current(self, policy: "CausalGDPPolicy") -> bool:
+    def is_current(self, policy: Policy) -> bool:
         """
         :param policy: The policy
         :return: Whether the views are still those of its networks, which may have been moved or replaced
@@ -284,7 +283,7 @@ class NumpyActing:
         return same and [tensor.data_ptr() for tensor in self._tensors] == self._addresses
 
     @staticmethod
-    def covers(policy: "CausalGDPPolicy") -> bool:
+    def covers(policy: Policy) -> bool:
         """
         :param policy: A policy
         :return: Whether this class can act for it: vectors of observations as they are, plain layers in float32 on a CPU, and
@@ -305,7 +304,7 @@ class NumpyActing:
             and (rule is None or not rule.needs_jacobian)
         )
 
-    def __call__(self, policy: "CausalGDPPolicy", features: np.ndarray, noise: np.ndarray, guided: bool) -> np.ndarray:
+    def __call__(self, policy: Policy, features: np.ndarray, noise: np.ndarray, guided: bool) -> np.ndarray:
         """
         :param policy: The policy, for its settings
         :param features: The observations, float32, shape ``(batch, n)``
@@ -328,7 +327,7 @@ class NumpyActing:
         return self.denoiser.sample(bound, noise[:, best], shift)
 
     def _shift(
-        self, policy: "CausalGDPPolicy", best: np.ndarray, gradient: np.ndarray, curvature: np.ndarray
+        self, policy: Policy, best: np.ndarray, gradient: np.ndarray, curvature: np.ndarray
     ) -> Callable[[np.ndarray, int], np.ndarray]:
         """What the linearised guidance takes off the predicted noise, see ``guidance_shift``."""
         rule, alpha_bar = self.rule, np.array(policy.actor.schedule.alpha_bar_list, dtype=best.dtype)
@@ -352,7 +351,7 @@ class NumpyActing:
 
         return shift
 
-    def _local_model(self, policy: "CausalGDPPolicy", state: np.ndarray, action: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _local_model(self, policy: Policy, state: np.ndarray, action: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Gradient and curvature of the guidance at the best candidate, whose predicted state is the one to reach."""
         response = self.world_model.response(state, action)
         if policy.guidance_target == "return":
@@ -370,7 +369,7 @@ class NumpyActing:
             curvature = curvature + np.float32(policy.state_guidance_scale) * (by_state.transpose(0, 2, 1) @ by_state)
         return gradient, curvature
 
-    def _value_jacobian(self, policy: "CausalGDPPolicy", response: dict[str, np.ndarray], action: np.ndarray) -> np.ndarray:
+    def _value_jacobian(self, policy: Policy, response: dict[str, np.ndarray], action: np.ndarray) -> np.ndarray:
         next_state = response["next_state"]
         noise = np.zeros((policy.actor.schedule.n_steps, *action.shape), dtype=action.dtype)
         next_action = self.denoiser.sample(self.denoiser.bind(next_state), noise)

@@ -12,6 +12,21 @@ from sb3_causalgdp.policies import CausalGDPPolicy
 
 
 @th.no_grad()
+def step_divergences(policy: CausalGDPPolicy, observations: PyTorchObs) -> th.Tensor:
+    """
+    KL divergence of each guided step of the denoising chain from the plain one, ``||mu_cg - mu||^2 / (2 sigma_k^2)``.
+
+    :param policy: A policy whose guidance is on
+    :param observations: A batch of observations
+    :return: The divergences, at least 0, from k = K down to 1, shape ``(K, batch)``
+    """
+    divergences: list[th.Tensor] = []
+    features = policy.actor.features(observations)
+    guidance = policy.acting_guidance(policy.causal_state(observations), policy.actor.sample(features))
+    policy.actor.sample(features, None, guidance, policy.guidance_rule, divergences)
+    return th.stack(divergences)
+
+
 def guidance_divergence(policy: CausalGDPPolicy, observations: PyTorchObs) -> float:
     """
     KL(pi_cg || pi) along the chain, the mean over a batch: the sum over k of ``||mu_cg - mu||^2 / (2 sigma_k^2)``.
@@ -20,11 +35,7 @@ def guidance_divergence(policy: CausalGDPPolicy, observations: PyTorchObs) -> fl
     :param observations: A batch of observations
     :return: The divergence, at least 0; Theorem 1 bounds the change of the return by its square root
     """
-    divergences: list[th.Tensor] = []
-    features = policy.actor.features(observations)
-    guidance = policy.acting_guidance(policy.causal_state(observations), policy.actor.sample(features))
-    policy.actor.sample(features, None, guidance, policy.guidance_rule, divergences)
-    return float(th.stack(divergences).sum(dim=0).mean())
+    return float(step_divergences(policy, observations).sum(dim=0).mean())
 
 
 @dataclass(frozen=True)

@@ -9,11 +9,13 @@ PACKAGE = Path(sb3_causalgdp.__file__).parent
 # From the roof to the ground: imports go down; the parts of one line do not import each other
 LAYERS = [
     {"zoo", "datasets"},
+    {"pictures"},
     {"__init__"},
     {"causalgdp"},
     {"callbacks"},
     {"losses", "diagnostics", "structural"},
     {"policies"},
+    {"acting"},
     {"causal", "offline", "diffusion"},
 ]
 WITHOUT_SB3 = {"causal", "diffusion", "losses"}
