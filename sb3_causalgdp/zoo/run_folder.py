@@ -1,0 +1,174 @@
+"""What RL Zoo left in the folder of a run."""
+
+import re
+import zipfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from stable_baselines3.common.monitor import LoadMonitorResultsError, load_results
+from stable_baselines3.common.results_plotter import X_TIMESTEPS, ts2xy
+from stable_baselines3.common.save_util import json_to_data
+
+from sb3_causalgdp.causal import CausalGraph
+
+# RL Zoo's name of a run: the environment, a number, and with --uuid the identifier
+RUN_NAME = re.compile(r"(?P<environment>.+)_(?P<number>\d+)(_[0-9a-f]{8}(-[0-9a-f]{4}){3}-[0-9a-f]{12})?")
+CHECKPOINT_NAME = re.compile(r"rl_model_(\d+)_steps\.zip")
+
+
+@dataclass(frozen=True)
+class Episodes:
+    """
+    :param steps: Environment steps at the end of each training episode, of all environments together
+    :param returns: Its return, in the environment's own rewards
+    :param seconds: Wall time since the start of the training
+    """
+
+    steps: np.ndarray
+    returns: np.ndarray
+    seconds: np.ndarray
+
+
+@dataclass(frozen=True)
+class Evaluations:
+    """
+    :param steps: When it was evaluated, shape ``(m,)``
+    :param returns: Of each episode, shape ``(m, n_episodes)``
+    """
+
+    steps: np.ndarray
+    returns: np.ndarray
+
+
+class RunFolder:
+    """
+    The folder of a run, such as ``logs/causalgdp/Pendulum-v1_1``. Its files are read when they are asked for.
+
+    Saved models and settings are pickles and YAML with Python objects in it, which execute code: open your own only.
+
+    :param path: The folder
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        found = sorted(path.glob("*/config.yml")) or sorted(path.glob("*/args.yml"))
+        self.settings_path = found[0].parent if found else None
+        self.arguments: Mapping[str, Any] = self._settings("args.yml") or {}
+        self.entry: Mapping[str, Any] | None = self._settings("config.yml")
+
+    def _settings(self, name: str) -> Mapping[str, Any] | None:
+        text = self._text(name)
+        settings = None if text is None else yaml.load(text, Loader=yaml.UnsafeLoader)
+        return settings if isinstance(settings, Mapping) else None
+
+    def _text(self, name: str) -> str | None:
+        path = None if self.settings_path is None else self.settings_path / name
+        return path.read_text(encoding="utf-8") if path is not None and path.is_file() else None
+
+    @property
+    def environment_id(self) -> str | None:
+        """Gymnasium's id of the environment, None if the run does not say."""
+        environment = self.arguments.get("env")
+        return None if environment is None else str(environment)
+
+    @property
+    def command(self) -> str | None:
+        """The command of the training, as RL Zoo wrote it."""
+        return self._text("command.txt")
+
+    # Models ---------------------------------------------------------------------------------------------------------------
+
+    def models(self) -> dict[str, Path]:
+        """
+        :return: Saved models by what they are: ``final``, ``best``, and the ``checkpoint`` of the most steps
+        """
+        final = [] if self.settings_path is None else [self.path / f"{self.settings_path.name}.zip"]
+        checkpoints = [path for _, path in self.checkpoints()]
+        candidates = {"final": final, "best": [self.path / "best_model.zip"], "checkpoint": checkpoints[-1:]}
+        return {name: paths[0] for name, paths in candidates.items() if paths and paths[0].is_file()}
+
+    def checkpoints(self) -> list[tuple[int, Path]]:
+        """
+        :return: Steps and file of each checkpoint, in their order
+        """
+        matches = [(CHECKPOINT_NAME.fullmatch(path.name), path) for path in self.path.glob("rl_model_*_steps.zip")]
+        return sorted((int(match[1]), path) for match, path in matches if match is not None)
+
+    def checkpoint_graphs(self) -> list[CausalGraph]:
+        """
+        :return: The causal graphs of the checkpoints, oldest first, each of them once
+        """
+        graphs: dict[int, CausalGraph] = {}
+        for _, path in self.checkpoints():
+            graph = saved_attributes(path).get("_causal_graph")
+            if graph is not None and graph.num_timesteps is not None:
+                graphs[graph.num_timesteps] = graph
+        return [graphs[steps] for steps in sorted(graphs)]
+
+    # Curves ---------------------------------------------------------------------------------------------------------------
+
+    def training_episodes(self) -> Episodes | None:
+        """
+        :return: The episodes of the training, None if none ended
+        """
+        try:
+            episodes = load_results(str(self.path))
+        except LoadMonitorResultsError:
+            return None
+        return None if len(episodes) == 0 else Episodes(*ts2xy(episodes, X_TIMESTEPS), episodes["t"].to_numpy())
+
+    def evaluations(self, folder: str = ".") -> Evaluations | None:
+        """
+        :param folder: Below the run's: ``offline`` has those of the offline stage, numbered by gradient steps
+        :return: The evaluations, None if there are none
+        """
+        path = self.path / folder / "evaluations.npz"
+        if not path.is_file():
+            return None
+        with np.load(path) as arrays:
+            return Evaluations(arrays["timesteps"], arrays["results"])
+
+
+def saved_attributes(path: Path) -> dict[str, Any]:
+    """
+    :param path: A saved model
+    :return: The attributes of the model, without its networks
+    """
+    with zipfile.ZipFile(path) as archive:
+        return json_to_data(archive.read("data").decode())
+
+
+def saved_versions(path: Path) -> dict[str, str]:
+    """
+    :param path: A saved model
+    :return: What SB3 says of the system on which it was saved
+    """
+    with zipfile.ZipFile(path) as archive:
+        lines = archive.read("system_info.txt").decode().splitlines() if "system_info.txt" in archive.namelist() else []
+    pairs = (line.removeprefix("- ").partition(": ") for line in lines)
+    return {name: value for name, separator, value in pairs if separator}
+
+
+def find_runs(folder: Path) -> list[RunFolder]:
+    """
+    :param folder: The folder of a run, or of an algorithm, which holds those of runs
+    :return: The run; or of each environment the run with the largest number. Empty if there is none
+    """
+    if _is_run(folder):
+        return [RunFolder(folder)]
+    latest: dict[str, tuple[int, float, Path]] = {}
+    for path in folder.iterdir() if folder.is_dir() else ():
+        name = RUN_NAME.fullmatch(path.name)
+        if name is not None and _is_run(path):
+            candidate = (int(name["number"]), path.stat().st_mtime, path)
+            latest[name["environment"]] = max(candidate, latest.get(name["environment"], candidate))
+    return [RunFolder(path) for _, (_, _, path) in sorted(latest.items())]
+
+
+def _is_run(folder: Path) -> bool:
+    patterns = ("*/config.yml", "*/args.yml", "best_model.zip", "rl_model_*_steps.zip", "evaluations.npz", "*.monitor.csv")
+    return folder.is_dir() and any(next(folder.glob(pattern), None) is not None for pattern in patterns)

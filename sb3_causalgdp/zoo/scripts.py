@@ -1,0 +1,155 @@
+"""What some of RL Zoo's scripts need around them to work with an algorithm that is not theirs, and on today's libraries."""
+
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any
+
+from sb3_causalgdp.zoo.registration import ALGORITHM, ZOO_HINT
+
+MODULE = "sb3_causalgdp.zoo"
+
+
+@contextmanager
+def replaced(owner: Any, name: str, value: Any) -> Iterator[None]:
+    """
+    :param owner: A module or a class
+    :param name: Its attribute
+    :param value: What it is for a while
+    """
+    before = getattr(owner, name)
+    setattr(owner, name, value)
+    try:
+        yield
+    finally:
+        setattr(owner, name, before)
+
+
+def own_command(command: Any) -> Any:
+    """
+    :param command: A command that one of RL Zoo's scripts starts
+    :return: The same through our entry point, where the algorithm is known, and with this Python
+    """
+    if not isinstance(command, Sequence) or isinstance(command, str) or not command or command[0] != "python":
+        return command
+    if command[1] == "-m" and command[2].startswith("rl_zoo3."):
+        return [sys.executable, "-m", MODULE, command[2].removeprefix("rl_zoo3."), *command[3:]]
+    if command[1] == "enjoy.py":
+        return [sys.executable, "-m", MODULE, "enjoy", *command[2:]]
+    return command
+
+
+@contextmanager
+def own_commands() -> Iterator[None]:
+    """The scripts that start other scripts start ours."""
+    call = subprocess.call
+
+    def call_ours(command: Any, *args: Any, **kwargs: Any) -> int:
+        return call(own_command(command), *args, **kwargs)
+
+    with replaced(subprocess, "call", call_ours):
+        yield
+
+
+@contextmanager
+def ffmpeg_on_path() -> Iterator[None]:
+    """
+    :raises ImportError: If there is no ffmpeg, neither on the path nor in the package imageio_ffmpeg
+    """
+    if shutil.which("ffmpeg") is not None:
+        yield
+        return
+    try:
+        import imageio_ffmpeg
+    except ImportError as error:
+        raise ImportError(f"ffmpeg is needed, from your system or by {ZOO_HINT}") from error
+    path = os.environ.get("PATH", "")
+    with tempfile.TemporaryDirectory() as folder:
+        Path(folder, "ffmpeg").symlink_to(imageio_ffmpeg.get_ffmpeg_exe())
+        os.environ["PATH"] = os.pathsep.join([folder, path])
+        try:
+            yield
+        finally:
+            os.environ["PATH"] = path
+
+
+@contextmanager
+def own_model_card() -> Iterator[None]:
+    """The model card names commands that work with this algorithm."""
+    import huggingface_hub.repocard as repocard
+
+    save = repocard.metadata_save
+
+    def save_ours(local_path: Any, data: Any) -> None:
+        card = Path(local_path)
+        text = card.read_text(encoding="utf-8")
+        if f"--algo {ALGORITHM} " in text:
+            text = text.replace("python -m rl_zoo3.", f"python -m {MODULE} ").replace("pip install rl_zoo3", ZOO_HINT)
+            card.write_text(text, encoding="utf-8")
+        save(local_path, data)
+
+    with replaced(repocard, "metadata_save", save_ours):
+        yield
+
+
+@contextmanager
+def model_card_metadata() -> Iterator[None]:
+    """RL Zoo imports a function that newer versions of the hub's package call otherwise; the older gave a dictionary."""
+    from huggingface_sb3 import push_to_hub as _  # noqa: F401 (the module behind the function of that name)
+
+    module = sys.modules["huggingface_sb3.push_to_hub"]
+    if hasattr(module, "generate_metadata"):
+        yield
+        return
+    module.generate_metadata = lambda *args: module._generate_metadata(*args).to_dict()  # type: ignore[attr-defined]
+    try:
+        yield
+    finally:
+        del module.generate_metadata  # type: ignore[attr-defined]
+
+
+@contextmanager
+def optional_hub_files() -> Iterator[None]:
+    """RL Zoo expects ``requests``' error for a file that a model does not have; newer versions of the hub raise another."""
+    import huggingface_sb3
+    from huggingface_hub.errors import EntryNotFoundError, LocalEntryNotFoundError
+    from requests.exceptions import HTTPError
+
+    load = huggingface_sb3.load_from_hub
+
+    def load_or_say_so(repo_id: str, filename: str) -> str:
+        try:
+            return load(repo_id, filename)
+        except LocalEntryNotFoundError:
+            raise  # there is no connection
+        except EntryNotFoundError as error:
+            raise HTTPError(str(error)) from error
+
+    with replaced(huggingface_sb3, "load_from_hub", load_or_say_so):
+        yield
+
+
+SURROUNDINGS: dict[str, list[Callable[[], Any]]] = {
+    "benchmark": [own_commands, optional_hub_files],
+    "enjoy": [optional_hub_files],
+    "load_from_hub": [optional_hub_files],
+    "push_to_hub": [model_card_metadata, own_model_card, ffmpeg_on_path],
+    "record_training": [own_commands, ffmpeg_on_path],
+}
+"""By script."""
+
+
+@contextmanager
+def surroundings(script: str) -> Iterator[None]:
+    """
+    :param script: Name of a script of RL Zoo, which runs inside
+    """
+    with ExitStack() as stack:
+        for make in SURROUNDINGS.get(script, []):
+            stack.enter_context(make())
+        yield
