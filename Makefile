@@ -26,7 +26,10 @@ check-codestyle:
 
 commit-checks: format type lint
 
+doc:
+	sphinx-build -W --keep-going -n -q docs docs/_build/html
+
 clean:
 	rm -rf build/ dist/ *.egg-info .pytest_cache .mypy_cache .ruff_cache .coverage htmlcov
 
-.PHONY: pytest mypy type lint format check-codestyle commit-checks clean
+.PHONY: pytest mypy type lint format check-codestyle commit-checks doc clean

@@ -18,10 +18,12 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 from multiprocessing.connection import Connection
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import numpy as np
+import torch as th
 
 from sb3_causalgdp.causal import DISCOVERY_METHODS, CausalGraph, TransitionVariables, make_discovery
 from sb3_causalgdp.causal.discovery import Statistics, make_statistics
@@ -36,13 +38,14 @@ class Estimate(NamedTuple):
     What a method says of each edge, laid out as ``CausalGraph.masks``.
 
     ``ranking``: larger for likelier edges. ``masks``: in [0, 1], an edge at 0.5 and above. ``effects``: sizes in standardised
-    units. ``probabilities``: whether the masks claim to be probabilities.
+    units. ``probabilities``: whether the masks claim to be probabilities. ``weights``: the effects with their signs.
     """
 
     ranking: np.ndarray
     masks: np.ndarray
     effects: np.ndarray
     probabilities: bool
+    weights: np.ndarray
 
 
 Fit = Callable[[np.ndarray, TransitionVariables], Estimate]
@@ -90,7 +93,7 @@ def ours_estimate(graph: CausalGraph) -> Estimate:
     """
     :param graph: What one of our methods returned
     """
-    return Estimate(graph.masks, graph.masks, np.abs(graph.effects), True)
+    return Estimate(graph.masks, graph.masks, np.abs(graph.effects), True, graph.effects)
 
 
 def standardise(rows: np.ndarray) -> np.ndarray:
@@ -137,8 +140,38 @@ def _causes(variables: TransitionVariables) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _peer_estimate(weights: np.ndarray, variables: TransitionVariables, threshold: float) -> Estimate:
-    sizes = np.abs(cut(weights, variables))
-    return Estimate(sizes, (sizes >= threshold).astype(float), sizes, False)
+    allowed = cut(weights, variables)
+    sizes = np.abs(allowed)
+    return Estimate(sizes, (sizes >= threshold).astype(float), sizes, False, allowed)
+
+
+def objective(weights: np.ndarray, rows: np.ndarray, variables: TransitionVariables, sparsity: float = SAME_SPARSITY) -> float:
+    """
+    What NOTEARS minimises, on standardised rows: half the mean square of the residuals, summed, and the L1 norm.
+
+    :param weights: Signed, laid out as ``CausalGraph.masks``
+    :param rows: [s, a, s', r], shape (N, 2 n + d + 1)
+    :param variables: Names and order of the columns
+    :param sparsity: Weight of the L1 norm
+    """
+    standardised = standardise(rows)
+    before, after = _causes(variables)
+    predicted = np.column_stack([standardised[:, before] @ weights[:-1].T, standardised[:, after] @ weights[-1]])
+    effects = np.column_stack([standardised[:, variables.next_state], standardised[:, variables.reward]])
+    return 0.5 * float(((effects - predicted) ** 2).sum()) / len(rows) + sparsity * float(np.abs(weights).sum())
+
+
+def agreement(estimate: Estimate, other: Estimate) -> dict[str, float]:
+    """
+    :param estimate: What a method says that solves our problem
+    :param other: What ours says
+    :return: the largest difference of two weights, and the number of edges that are at least 0.1 in one alone
+    """
+    edges, others = np.abs(estimate.weights) >= 0.1, np.abs(other.weights) >= 0.1
+    return {
+        "weight_gap": float(np.abs(estimate.weights - other.weights).max()),
+        "support_gap": int((edges != others).sum()),
+    }
 
 
 def load_zheng_notears(allowed_only: bool = False) -> Fit:
@@ -348,6 +381,27 @@ def seconds_per_call(call: Callable[[], Any], min_seconds: float = 0.0) -> tuple
             return spent / n_calls, value
 
 
+def resident_mib(largest: bool = False) -> float:
+    """
+    :param largest: Since the process began, instead of now
+    :return: MiB of memory that the process holds
+    """
+    if largest:
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * resource.getpagesize() / 2**20
+
+
+def product_gflops(size: int = 1024, repeats: int = 5) -> float:
+    """
+    :param size: Of the matrices
+    :param repeats: The fastest of so many counts
+    :return: floating point operations per nanosecond of a product of two matrices of float64, by torch
+    """
+    matrix = th.rand(size, size, dtype=th.float64)
+    return 2e-9 * size**3 / min(seconds_per_call(lambda: matrix @ matrix)[0] for _ in range(repeats))
+
+
 def run_limited(call: Callable[[], Any], limit_s: float, min_seconds: float = 0.0) -> Outcome:
     """
     Call in a forked child, whose CPU seconds are limited by the system.
@@ -378,8 +432,7 @@ def _in_child(call: Callable[[], Any], limit_s: float, min_seconds: float, sende
     start = time.process_time()
     try:
         spent, value = seconds_per_call(call, min_seconds)
-        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-        sender.send(Outcome("ok", spent, value, peak))
+        sender.send(Outcome("ok", spent, value, resident_mib(largest=True)))
     except Exception:
         sender.send(Outcome("failed", time.process_time() - start, error=traceback.format_exc().strip().splitlines()[-1]))
     sender.close()

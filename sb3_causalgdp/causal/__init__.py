@@ -7,6 +7,7 @@ from sb3_causalgdp.causal.discovery import (
     discover,
     make_discovery,
     make_statistics,
+    min_rows,
 )
 from sb3_causalgdp.causal.graph import CausalGraph
 from sb3_causalgdp.causal.guidance import CausalGuidance, LinearisedGuidance, ReturnTarget, RewardTarget
@@ -43,4 +44,5 @@ __all__ = [
     "discover",
     "make_discovery",
     "make_statistics",
+    "min_rows",
 ]

@@ -149,9 +149,9 @@ def run(arguments: argparse.Namespace) -> None:
 def _check_plot(path: str | None) -> None:
     """Before anything is read, so that a missing package or a wrong suffix costs no time."""
     if path is not None:
-        from sb3_causalgdp.causal import plots
+        from sb3_causalgdp.causal.plots import check_suffix
 
-        plots._check_suffix(path)
+        check_suffix(path)
 
 
 @contextmanager

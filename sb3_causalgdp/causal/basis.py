@@ -8,7 +8,9 @@ import numpy.typing as npt
 from sb3_causalgdp.causal.moments import StreamingMoments
 from sb3_causalgdp.causal.variables import TransitionVariables
 
+BASES = ("auto", "linear", "additive", "products")
 N_FUNCTIONS = 4  # each variable as itself, its square, sine and tanh
+MOST_INPUTS_WITH_PRODUCTS = 60
 FEATURE_BOUND = 5.0  # standard deviations: outliers must not rule the squares and products
 FEED_ROWS = 512  # so that the features of a batch need little memory beside the moments
 
@@ -16,24 +18,27 @@ FEED_ROWS = 512  # so that the features of a batch need little memory beside the
 @dataclass
 class BasisExpansion:
     """
-    Features of p standardised inputs z: ``[z, z^2, sin z, tanh z]`` and, if asked for, the products ``z_i z_j``, i < j.
+    Features of p standardised inputs z: ``z`` alone, or ``[z, z^2, sin z, tanh z]``, or these and the products ``z_i z_j``,
+    i < j.
 
     All but the first are functions of z limited to [-5, 5].
 
     :param location: Means of the inputs, shape (p,)
     :param scale: Standard deviations of the inputs, 1 for inputs that do not move, shape (p,)
-    :param products: Whether there are products
+    :param basis: ``"linear"``, ``"additive"`` or ``"products"``
     """
 
     location: np.ndarray
     scale: np.ndarray
-    products: bool
+    basis: str
 
     def __post_init__(self) -> None:
         n_inputs = len(self.location)
+        self.products = self.basis == "products"
+        self.n_functions = 1 if self.basis == "linear" else N_FUNCTIONS
         first, second = np.triu_indices(n_inputs, k=1)
         self._first, self._second = (first, second) if self.products else (first[:0], second[:0])
-        self.n_features = N_FUNCTIONS * n_inputs + len(self._first)
+        self.n_features = number_of_features(n_inputs, self.basis)
 
     def standardise(self, inputs: np.ndarray) -> np.ndarray:
         """
@@ -47,59 +52,82 @@ class BasisExpansion:
         :param standardised: z, shape (N, p)
         :return: shape (N, n_features)
         """
+        own = self._functions(standardised)
+        if not self.products:
+            return own
         bounded = _bounded(standardised)
-        products = bounded[:, self._first] * bounded[:, self._second]
-        return np.concatenate([_functions(standardised), products], axis=1)
+        return np.concatenate([own, bounded[:, self._first] * bounded[:, self._second]], axis=1)
 
-    def difference(self, standardised: np.ndarray, variable: int, half_step: float) -> np.ndarray:
+    def differences(self, standardised: np.ndarray, variables: np.ndarray, half_steps: np.ndarray) -> np.ndarray:
         """
         How much larger the features are when a variable is half a step above its value instead of half a step below.
 
         :param standardised: z, shape (N, p)
-        :param variable: Index of an input
-        :param half_step: In units of z
-        :return: of the features in ``features_of(variable)``, the others do not change; shape (N, len(features_of(variable)))
+        :param variables: Indices of q inputs
+        :param half_steps: Of all inputs, in units of z, shape (p,)
+        :return: for each variable, of the features in ``features_of``, the others do not change; shape (q, N, g)
         """
-        above, below = standardised[:, [variable]] + half_step, standardised[:, [variable]] - half_step
-        own = _functions(above) - _functions(below)
+        above, below = standardised + half_steps, standardised - half_steps
+        own = self._functions(above) - self._functions(below)
+        own = own.reshape(len(standardised), self.n_functions, -1).transpose(2, 0, 1)[variables]
         if not self.products:
             return own
-        others = np.delete(_bounded(standardised), variable, axis=1)
-        return np.concatenate([own, (_bounded(above) - _bounded(below)) * others], axis=1)
+        bounded, change = _bounded(standardised), _bounded(above) - _bounded(below)
+        shared = np.empty((len(own), len(bounded), bounded.shape[1] - 1))
+        for of_variable, i in zip(shared, variables, strict=True):
+            np.multiply(change[:, [i]], np.delete(bounded, i, axis=1), out=of_variable)
+        return np.concatenate([own, shared], axis=2)
 
-    def features_of(self, variable: int) -> np.ndarray:
+    def features_of(self, variables: np.ndarray) -> np.ndarray:
         """
-        :param variable: Index of an input
-        :return: indices of the features that it is part of: 4, and p - 1 products, each group in the order of the inputs
+        :param variables: Indices of q inputs
+        :return: for each, the indices of the g features that it is part of: 1 or 4, and p - 1 products, each group in the
+            order of the inputs; shape (q, g)
         """
         n_inputs = len(self.location)
-        own = variable + n_inputs * np.arange(N_FUNCTIONS)
-        shared = np.flatnonzero((self._first == variable) | (self._second == variable))
-        return np.concatenate([own, N_FUNCTIONS * n_inputs + shared])
+        own = np.asarray(variables)[:, None] + n_inputs * np.arange(self.n_functions)
+        if not self.products:
+            return own
+        pairs = np.zeros((n_inputs, n_inputs), dtype=own.dtype)
+        pairs[self._first, self._second] = pairs[self._second, self._first] = np.arange(len(self._first))
+        others = ~np.eye(n_inputs, dtype=bool)[variables]
+        shared = pairs[variables][others].reshape(len(own), n_inputs - 1)
+        return np.concatenate([own, self.n_functions * n_inputs + shared], axis=1)
 
     def subset(self, inputs: np.ndarray, functions: int, products: bool) -> np.ndarray:
         """
         :param inputs: Indices of the inputs that are kept
-        :param functions: How many of the functions are kept, from 1 (linear) to 4
+        :param functions: How many of the functions are kept, from 1 (linear) to 4, if there are as many
         :param products: Whether the products are kept, if there are any
         :return: indices of the features of these inputs alone
         """
         n_inputs = len(self.location)
-        own = (np.asarray(inputs) + n_inputs * np.arange(functions)[:, None]).ravel()
+        own = (np.asarray(inputs) + n_inputs * np.arange(min(functions, self.n_functions))[:, None]).ravel()
         if not products:
             return own
         both = np.flatnonzero(np.isin(self._first, inputs) & np.isin(self._second, inputs))
-        return np.concatenate([own, N_FUNCTIONS * n_inputs + both])
+        return np.concatenate([own, self.n_functions * n_inputs + both])
+
+    def _functions(self, standardised: np.ndarray) -> np.ndarray:
+        """The features that are functions of one variable, shape (N, p) or (N, 4 p)."""
+        if self.n_functions == 1:
+            return standardised
+        bounded = _bounded(standardised)
+        return np.concatenate([standardised, bounded**2, np.sin(bounded), np.tanh(bounded)], axis=1)
+
+
+def number_of_features(n_inputs: int, basis: str) -> int:
+    """
+    :param n_inputs: Number p of inputs
+    :param basis: ``"linear"``, ``"additive"`` or ``"products"``
+    """
+    if basis == "linear":
+        return n_inputs
+    return N_FUNCTIONS * n_inputs + (n_inputs * (n_inputs - 1) // 2 if basis == "products" else 0)
 
 
 def _bounded(standardised: np.ndarray) -> np.ndarray:
     return np.clip(standardised, -FEATURE_BOUND, FEATURE_BOUND)
-
-
-def _functions(standardised: np.ndarray) -> np.ndarray:
-    """The features that are functions of one variable, shape (N, 4 p)."""
-    bounded = _bounded(standardised)
-    return np.concatenate([standardised, bounded**2, np.sin(bounded), np.tanh(bounded)], axis=1)
 
 
 class BasisMoments:
@@ -113,7 +141,8 @@ class BasisMoments:
     :param variables: Names and order of the variables
     :param half_life: Number of new rows after which an old row weighs half; None weighs all alike
     :param window: Number of newest rows that are kept; None keeps all
-    :param products: Whether products of pairs are among the features; None: where states and actions are at most 60
+    :param basis: The features, see :class:`BasisExpansion`; ``"auto"`` is ``"products"`` where states and actions are at most
+        60, else ``"additive"``
     :param max_memory: Bytes that the moments may take; fewer blocks are kept where 8 of them need more
     :raises ValueError: when two blocks need more memory than that
     """
@@ -128,27 +157,29 @@ class BasisMoments:
         variables: TransitionVariables,
         half_life: float | None = None,
         window: int | None = None,
-        products: bool | None = None,
+        basis: str = "auto",
         max_memory: float = 200e6,
     ) -> None:
         n_states, n_inputs = variables.n_states, variables.n_states + variables.n_actions
         self.variables = variables
-        self.products = n_inputs <= 60 if products is None else products
+        self.basis = basis
+        if basis == "auto":
+            self.basis = "products" if n_inputs <= MOST_INPUTS_WITH_PRODUCTS else "additive"
         self.raw = StreamingMoments(variables.n_variables, half_life, variables.names, window)
-        n_features = N_FUNCTIONS * n_inputs + (n_inputs * (n_inputs - 1) // 2 if self.products else 0)
-        block_bytes = 8 * ((n_features + n_states) ** 2 + (n_features + 1) ** 2)
+        n_features = number_of_features(n_inputs, self.basis)
+        block_bytes = 8 * n_features * (2 * n_features + n_states + 1)
         n_blocks = min(self.MAX_BLOCKS, 2 * int(max_memory // (2 * block_bytes)))
         if n_blocks < 2:
-            advice = "use products=False, or more memory" if self.products else "give it more memory"
+            simpler = {"products": "use basis='additive', or ", "additive": "use basis='linear', or "}.get(self.basis, "")
             raise ValueError(
                 f"{n_features} features of {n_inputs} states and actions need {2 * block_bytes / 1e6:.0f} MB, "
-                f"and max_memory is {max_memory / 1e6:.0f} MB: {advice}"
+                f"and max_memory is {max_memory / 1e6:.0f} MB: {simpler}give it more memory"
             )
-        self.dynamics = StreamingMoments(n_features + n_states, half_life, window=window, n_blocks=n_blocks)
-        self.reward = StreamingMoments(n_features + 1, half_life, window=window, n_blocks=n_blocks)
-        columns = np.arange(variables.n_variables)
-        self.inputs_of_dynamics = columns[:n_inputs]
-        self.inputs_of_reward = np.concatenate([columns[variables.next_state], columns[variables.action]])
+        self.dynamics, self.reward = (
+            StreamingMoments(n_features + n_targets, half_life, window=window, n_blocks=n_blocks, n_targets=n_targets)
+            for n_targets in (n_states, 1)
+        )
+        self.inputs_of_dynamics, self.inputs_of_reward = variables.causes_of_state, variables.causes_of_reward
         self.expansions: tuple[BasisExpansion, BasisExpansion] | None = None
         self.recent = np.empty((0, variables.n_variables))
         """The newest rows, at most 256."""
@@ -211,16 +242,18 @@ class BasisMoments:
         self._feed(rows)
 
     def _set_expansions(self) -> None:
-        mean, scale = self.raw.mean, np.where(self.raw.constant, 1.0, self.raw.standard_deviation())
+        spread = self.raw.spread()
+        mean, scale = spread.mean, np.where(spread.constant, 1.0, spread.standard_deviation())
         first, second = (
-            BasisExpansion(mean[inputs], scale[inputs], self.products)
+            BasisExpansion(mean[inputs], scale[inputs], self.basis)
             for inputs in (self.inputs_of_dynamics, self.inputs_of_reward)
         )
         self.expansions = (first, second)
 
     def _has_moved(self) -> bool:
         assert self.expansions is not None
-        mean, deviation, moving = self.raw.mean, self.raw.standard_deviation(), ~self.raw.constant
+        spread = self.raw.spread()
+        mean, deviation, moving = spread.mean, spread.standard_deviation(), ~spread.constant
         for expansion, inputs in zip(self.expansions, (self.inputs_of_dynamics, self.inputs_of_reward), strict=True):
             here = moving[inputs]
             ratio = deviation[inputs][here] / expansion.scale[here]

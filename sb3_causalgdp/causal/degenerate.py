@@ -1,10 +1,17 @@
 """What no data can tell apart: variables that never move, and variables that are linear functions of each other."""
 
 from dataclasses import dataclass
+from datetime import datetime, timezone
+from typing import Any
 
 import numpy as np
+import torch as th
+
+from sb3_causalgdp.causal.variables import TransitionVariables
 
 DEPENDENT_SHARE = 1e-8  # of a variable's variance left by the others; rounding of float32 leaves 1e-14
+SUSPICIOUS_SHARE = 1e-2  # of a variable's variance left by those before it: of more, it is independent of these
+RIDGE = 1e-8  # takes the factorisation past dependent variables
 SMALLEST_COEFFICIENT = 1e-3
 
 
@@ -32,47 +39,92 @@ class Degeneracy:
             shared[:, group] = masks[:, group].max(axis=1, keepdims=True)
         return shared
 
-    def names_of_groups(self, names: tuple[str, ...]) -> tuple[tuple[str, ...], ...]:
-        """
-        :param names: Names of the p variables
-        :return: the groups by name, in the order of the variables
-        """
-        return tuple(tuple(names[i] for i in sorted(group)) for group in self.groups)
-
 
 def find_degeneracy(correlation: np.ndarray) -> Degeneracy:
     """
     Find linear dependence by Cholesky factorisation with pivoting (Higham, 2002, "Accuracy and Stability of Numerical
-    Algorithms", 10.3): a variable is dependent when the pivots leave less than 1e-8 of its variance.
+    Algorithms", 10.3): a variable is dependent when the pivots leave less than 1e-8 of its variance. Variables that are
+    clearly independent of those before them come first, without pivoting.
 
     :param correlation: Correlation matrix, its diagonal 0 for variables that do not move, shape (p, p); never changed
     :return: what is independent and what hangs together
     """
-    left = np.diagonal(correlation).copy()
-    factor = np.zeros_like(correlation)
-    pivots: list[int] = []
-    while len(pivots) < len(correlation):
-        pivot = int(left.argmax())
-        if left[pivot] <= DEPENDENT_SHARE:
-            break
-        n_done = len(pivots)
-        column = (correlation[pivot] - factor[:n_done, pivot] @ factor[:n_done]) / np.sqrt(left[pivot])
-        factor[n_done] = column
-        left -= column**2
-        pivots.append(pivot)
-        left[pivots] = 0.0
-    kept = np.sort(np.array(pivots, dtype=int))
-    dependent = np.setdiff1d(np.flatnonzero(np.diagonal(correlation) > 0.0), kept)
-    if len(dependent) == 0:
-        return Degeneracy(kept, (), {})
-    coefficients = np.linalg.solve(correlation[np.ix_(kept, kept)], correlation[np.ix_(kept, dependent)])
-    strongest = np.abs(coefficients).argmax(axis=0)
+    return _degeneracy(correlation, _factor(correlation))
+
+
+def variance_inflation(correlation: np.ndarray, n_last: int) -> np.ndarray:
+    """
+    Variance inflation factors ``1 / (1 - R^2)`` of the last variables, each regressed on all others.
+
+    :param correlation: Correlation matrix, its diagonal 0 for variables that do not move, shape (p, p); never changed
+    :param n_last: Number k of the last variables, at most p
+    :return: at least 1 and at most 1e8, which stands for exact dependence; 1 for variables that do not move; shape (k,)
+    """
+    return _inflation(_factor(correlation), n_last)
+
+
+def _factor(correlation: np.ndarray) -> th.Tensor:
+    """Lower Cholesky factor without pivoting, shape (p, p); its squared diagonal is what the variables before one leave."""
+    moving = np.diagonal(correlation) > 0.0
+    return th.linalg.cholesky(th.from_numpy(correlation + np.diag(np.where(moving, RIDGE, 1.0))))
+
+
+def _degeneracy(correlation: np.ndarray, factor: th.Tensor) -> Degeneracy:
+    moving = np.flatnonzero(np.diagonal(correlation) > 0.0)
+    left = factor.diagonal().numpy()[moving] ** 2
+    sure, others = moving[left > SUSPICIOUS_SHARE], moving[left <= SUSPICIOUS_SHARE]
+    if len(others) == 0:
+        return Degeneracy(moving, (), {})
+    of_sure = th.linalg.cholesky(_part(correlation, sure, sure))
+    explained = th.linalg.solve_triangular(of_sure, _part(correlation, sure, others), upper=False)
+    pivots, factor = _pivots((_part(correlation, others, others) - explained.T @ explained).numpy())
+    kept, rest = np.concatenate([sure, others[pivots]]), np.setdiff1d(np.arange(len(others)), pivots)
+    if len(rest) == 0:
+        return Degeneracy(np.sort(kept), (), {})
+    # What the kept ones say about each dependent one: back through both factors
+    of_pivots = th.linalg.solve_triangular(factor[:, pivots], factor[:, rest], upper=True)
+    of_others = th.linalg.solve_triangular(of_sure.T, explained[:, rest] - explained[:, pivots] @ of_pivots, upper=True)
+    coefficients = th.cat([of_others, of_pivots]).numpy()
+    dependent, strongest = others[rest], np.abs(coefficients).argmax(axis=0)
     stand_in = {
         int(variable): (int(kept[row]), float(np.sign(coefficients[row, j])))
         for j, (variable, row) in enumerate(zip(dependent, strongest, strict=True))
     }
     members = [{int(v), *kept[np.abs(coefficients[:, j]) > SMALLEST_COEFFICIENT].tolist()} for j, v in enumerate(dependent)]
-    return Degeneracy(kept, _merged_groups(members, set(dependent.tolist())), stand_in)
+    return Degeneracy(np.sort(kept), _merged_groups(members, set(dependent.tolist())), stand_in)
+
+
+def _part(matrix: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> th.Tensor:
+    # Twice as fast as np.ix_
+    return th.from_numpy(matrix[rows][:, columns])
+
+
+def _pivots(remaining: np.ndarray) -> tuple[list[int], th.Tensor]:
+    """
+    Cholesky factorisation with pivoting.
+
+    :param remaining: Covariance matrix of variables that have had variance 1, shape (q, q)
+    :return: indices of k linearly independent variables, each time the one of which most is left; and the factor, shape (k, q)
+    """
+    left = np.diagonal(remaining).copy()
+    factor = np.empty_like(remaining)
+    pivots: list[int] = []
+    while len(pivots) < len(remaining):
+        pivot, row = int(left.argmax()), len(pivots)
+        if left[pivot] <= DEPENDENT_SHARE:
+            break
+        factor[row] = (remaining[pivot] - factor[:row, pivot] @ factor[:row]) / np.sqrt(left[pivot])
+        left -= factor[row] ** 2
+        pivots.append(pivot)
+        left[pivots] = 0.0
+    return pivots, th.from_numpy(factor[: len(pivots)])
+
+
+def _inflation(factor: th.Tensor, n_last: int) -> np.ndarray:
+    # The last block of the factor is that of what the variables before it leave of the last ones
+    last = factor[len(factor) - n_last :, len(factor) - n_last :]
+    inverse = th.linalg.solve_triangular(last, th.eye(n_last, dtype=last.dtype), upper=False)
+    return np.clip(inverse.square().sum(dim=0).numpy(), 1.0, 1.0 / DEPENDENT_SHARE)
 
 
 def _merged_groups(members: list[set[int]], dependent: set[int]) -> tuple[tuple[int, ...], ...]:
@@ -81,17 +133,59 @@ def _merged_groups(members: list[set[int]], dependent: set[int]) -> tuple[tuple[
     for new in members:
         joined = new.union(*(group for group in groups if group & new))
         groups = [group for group in groups if not group & new] + [joined]
-    return tuple(tuple(sorted(group, key=lambda i: (i in dependent, i))) for group in groups)
+    return tuple(tuple(sorted(group, key=lambda i: (i in dependent, i))) for group in sorted(groups, key=min))
 
 
-def variance_inflation(correlation: np.ndarray) -> np.ndarray:
+@dataclass(frozen=True)
+class Limits:
     """
-    Variance inflation factor of each variable, ``1 / (1 - R^2)`` of its regression on the others.
+    What the data of a refresh cannot say, whatever the method.
 
-    :param correlation: Correlation matrix, its diagonal 0 for variables that do not move, shape (p, p)
-    :return: at least 1 and at most 1e8, which stands for exact dependence; 1 for variables that do not move; shape (p,)
+    :param of_dynamics: Degeneracy among (s, a), the possible causes of s'
+    :param of_reward: Degeneracy among (s', a), the possible causes of r
+    :param action_vif: Variance inflation factors of the actions among (s, a), shape (d,)
+    :param constant_variables: Names of the variables that never moved
+    :param duplicated_variables: Groups of names that are linear functions of each other, among (s, a) or among (s', a)
     """
-    moving = np.diagonal(correlation) > 0.0
-    ridge = np.where(moving, DEPENDENT_SHARE, 1.0)
-    precision = np.diagonal(np.linalg.inv(correlation + np.diag(ridge)))
-    return np.where(moving, np.clip(precision, 1.0, 1.0 / DEPENDENT_SHARE), 1.0)
+
+    of_dynamics: Degeneracy
+    of_reward: Degeneracy
+    action_vif: np.ndarray
+    constant_variables: tuple[str, ...]
+    duplicated_variables: tuple[tuple[str, ...], ...]
+
+    def remarks(self) -> dict[str, Any]:
+        """
+        :return: the fields of a :class:`~sb3_causalgdp.causal.graph.CausalGraph` that say this, and when it was found
+        """
+        return {
+            "action_vif": self.action_vif,
+            "constant_variables": self.constant_variables,
+            "duplicated_variables": self.duplicated_variables,
+            "found_at": datetime.now(timezone.utc).isoformat(timespec="seconds"),
+        }
+
+
+def find_limits(correlation: np.ndarray, variables: TransitionVariables) -> Limits:
+    """
+    :param correlation: Correlation matrix of all variables, its diagonal 0 for those that do not move; never changed
+    :param variables: Names and order of the variables
+    :return: what the data cannot say
+    """
+    causes = variables.causes_of_state, variables.causes_of_reward
+    now, after = (correlation[columns][:, columns] for columns in causes)
+    factor = _factor(now)
+    of_dynamics, of_reward = _degeneracy(now, factor), find_degeneracy(after)
+    names = variables.names
+    constant = np.flatnonzero(np.diagonal(correlation) == 0.0)
+    # A group of states that is one of next states as well is listed once
+    known = [set(group) for group in of_dynamics.groups]
+    alone = [group for group in of_reward.groups if set(group) not in known]
+    listed = [(causes[0], group) for group in of_dynamics.groups] + [(causes[1], group) for group in alone]
+    return Limits(
+        of_dynamics,
+        of_reward,
+        action_vif=_inflation(factor, variables.n_actions),
+        constant_variables=tuple(names[i] for i in constant),
+        duplicated_variables=tuple(tuple(names[columns[i]] for i in sorted(group)) for columns, group in listed),
+    )

@@ -114,11 +114,12 @@ class CausalGraph:
         if self.standard_errors is not None and self.standard_errors.min() < 0:
             raise ValueError(f"standard_errors must be at least 0, got {self.standard_errors.min():g}")
         self._check_scalars()
-        self.constant_variables = _checked_names("constant_variables", self.constant_variables, self.variables)
+        known = frozenset(self.variables.names)
+        self.constant_variables = _checked_names("constant_variables", self.constant_variables, known)
         if isinstance(self.duplicated_variables, str) or not isinstance(self.duplicated_variables, Iterable):
             raise ValueError(f"duplicated_variables must be groups of names, got {self.duplicated_variables!r}")
         self.duplicated_variables = tuple(
-            _checked_names("duplicated_variables", group, self.variables) for group in self.duplicated_variables
+            _checked_names("duplicated_variables", group, known) for group in self.duplicated_variables
         )
 
     def _check_scalars(self) -> None:
@@ -428,13 +429,12 @@ def _checked(name: str, values: Any, shape: tuple[int, ...]) -> np.ndarray:
     return values
 
 
-def _checked_names(argument: str, names: Any, variables: TransitionVariables) -> tuple[str, ...]:
-    """The names as a tuple, all of them variables."""
+def _checked_names(argument: str, names: Any, known: frozenset[str]) -> tuple[str, ...]:
+    """The names as a tuple, all of them known."""
     if isinstance(names, str) or not isinstance(names, Iterable):
         raise ValueError(f"{argument} must be names of variables, got {names!r}")
     names = tuple(names)
-    known = variables.names
     unknown = [name for name in names if name not in known]
     if unknown:
-        raise ValueError(f"{argument} must be names of variables, got {unknown}, known are {known}")
+        raise ValueError(f"{argument} must be names of variables, got {unknown}, known are {sorted(known)}")
     return names

@@ -3,6 +3,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+import torch as th
 
 LARGEST_VALUE = 1e140  # so that the sum of squares stays inside float64
 CONSTANT_FLOOR = 1e-10  # a million times float64's rounding, yet below a sensor at 1e6 with sd 1e-3
@@ -11,24 +12,78 @@ FORGOTTEN = 1e-9  # weight of a block, relative to that of the newest batch, tha
 
 
 @dataclass(frozen=True, eq=False)
-class Moments:
-    """Weighted count, mean of shape (p,), and co-moment (sum of the products of deviations) of shape (p, p)."""
+class Spread:
+    """
+    Where the rows of p columns lie.
+
+    :param count: Sum of the rows' weights
+    :param mean: shape (p,)
+    :param squares: Weighted sums of the squared deviations from the mean, shape (p,)
+    """
 
     count: float
     mean: np.ndarray
+    squares: np.ndarray
+
+    def standard_deviation(self) -> np.ndarray:
+        """
+        :return: population standard deviation, shape (p,)
+        """
+        return np.sqrt(self.squares / self.count)
+
+    @property
+    def constant(self) -> np.ndarray:
+        """Which columns do not move: standard deviation at most 1e-10 max(1, \\|mean\\|), boolean, shape (p,)."""
+        return self.standard_deviation() <= CONSTANT_FLOOR * np.maximum(1.0, np.abs(self.mean))
+
+
+@dataclass(frozen=True, eq=False)
+class Moments(Spread):
+    """
+    The spread, and the sums of products of deviations. The last m columns may be targets, whose products with each other are
+    not kept.
+
+    :param comoment: Of the columns that are no targets, shape (p - m, p - m)
+    :param cross: Of these with the targets, shape (p - m, m)
+    """
+
     comoment: np.ndarray
+    cross: np.ndarray
 
     def covariance(self) -> np.ndarray:
         """
-        :return: population covariance (divided by the count), shape (p, p)
+        :return: population covariance (divided by the count) of the columns that are no targets, shape (p - m, p - m)
         """
         return self.comoment / self.count
 
+    def correlation(self) -> np.ndarray:
+        """
+        :return: correlation matrix of the columns that are no targets, shape (p - m, p - m); rows and columns of constant
+            variables are zero, diagonal included
+        """
+        n_inputs = len(self.comoment)
+        moving = ~self.constant[:n_inputs]
+        inverse = moving / np.where(moving, np.sqrt(self.squares[:n_inputs]), 1.0)
+        correlation = self.comoment * inverse
+        correlation *= inverse[:, None]
+        # Exactly, so that rounding does not decide between copies
+        np.fill_diagonal(correlation, moving)
+        return correlation
 
-def with_rows(before: Moments | None, rows: np.ndarray) -> Moments:
+    def faded(self, factor: float) -> "Moments":
+        """
+        :param factor: What all weights are multiplied with
+        :return: moments of the same rows
+        """
+        sums = (factor * self.squares, factor * self.comoment, factor * self.cross)
+        return Moments(factor * self.count, self.mean, *sums)
+
+
+def with_rows(before: Moments | None, rows: np.ndarray, n_targets: int = 0) -> Moments:
     """
-    :param before: Moments of other rows, or None; its co-moment becomes that of the result
+    :param before: Moments of other rows, or None; its products become those of the result
     :param rows: At least one row of float64, shape (N, p); never changed
+    :param n_targets: Number m of the last columns that are targets
     :return: moments of all these rows, by the formula of ``merge``
     """
     # The last row is for the distance between the means, so that one product gives all
@@ -40,27 +95,59 @@ def with_rows(before: Moments | None, rows: np.ndarray) -> Moments:
     mean += rows[0]
     count = float(len(rows))
     if before is None:
-        return Moments(count, mean, deviations.T @ deviations)
+        n_inputs = len(mean) - n_targets
+        none = np.zeros_like(mean), np.zeros((n_inputs, n_inputs)), np.zeros((n_inputs, n_targets))
+        before = Moments(0.0, mean, *none)
     total, shift = before.count + count, mean - before.mean
     deviations[-1] = np.sqrt(before.count * count / total) * shift
-    comoment = before.comoment
-    comoment += deviations.T @ deviations
-    return Moments(total, before.mean + shift * (count / total), comoment)
+    _add_products(deviations, before.comoment, before.cross)
+    squares = before.squares + np.einsum("ij,ij->j", deviations, deviations)
+    return Moments(total, before.mean + shift * (count / total), squares, before.comoment, before.cross)
 
 
-def merge(parts: Sequence[Moments]) -> Moments:
+def merge(parts: Sequence[Moments], into_first: bool = False) -> Moments:
     """
-    :param parts: Moments of disjoint sets of rows, at least one; never changed
+    :param parts: Moments of disjoint sets of rows, at least one
+    :param into_first: Whether the products of the first part may become those of the result; else no part is changed
     :return: moments of all their rows, by the parallel formula of Chan, Golub and LeVeque (1983) for any number of parts
     """
+    comoment, cross = parts[0].comoment, parts[0].cross
+    if not into_first:
+        comoment, cross = comoment.copy(), cross.copy()
+    for part in parts[1:]:
+        comoment += part.comoment
+        cross += part.cross
+    spread, between = _between(parts)
+    if len(parts) > 1:
+        _add_products(between, comoment, cross)
+    return Moments(spread.count, spread.mean, spread.squares, comoment, cross)
+
+
+def merge_spread(parts: Sequence[Spread]) -> Spread:
+    """
+    :param parts: Of disjoint sets of rows, at least one; never changed
+    :return: the spread of all their rows
+    """
+    return _between(parts)[0]
+
+
+def _between(parts: Sequence[Spread]) -> tuple[Spread, np.ndarray]:
+    """The spread of all, and the deviations of the parts' means, weighted so that their products are those of the rows."""
     counts = np.array([part.count for part in parts])
     shifts = np.stack([part.mean for part in parts]) - parts[0].mean
     shift = counts @ shifts / counts.sum()
     between = np.sqrt(counts)[:, None] * (shifts - shift)
-    comoment = between.T @ between
-    for part in parts:
-        comoment += part.comoment
-    return Moments(float(counts.sum()), parts[0].mean + shift, comoment)
+    squares = np.sum([part.squares for part in parts], axis=0) + (between**2).sum(axis=0)
+    return Spread(float(counts.sum()), parts[0].mean + shift, squares), between
+
+
+def _add_products(deviations: np.ndarray, comoment: np.ndarray, cross: np.ndarray) -> None:
+    """In place: another matrix of this size would be felt. By torch, whose product of matrices is faster than numpy's."""
+    values, n_inputs = th.from_numpy(deviations), len(comoment)
+    inputs, targets = values[:, :n_inputs], values[:, n_inputs:]
+    th.from_numpy(comoment).addmm_(inputs.T, inputs)
+    if targets.shape[1] > 0:
+        th.from_numpy(cross).addmm_(inputs.T, targets)
 
 
 class StreamingMoments:
@@ -81,6 +168,7 @@ class StreamingMoments:
     :param window: Number of newest rows that are kept, at least ``n_blocks``, to one block; None keeps all
     :param n_blocks: Number of blocks, 1 or an even number: what a jackknife leaves out one by one, and the grain of the
         window; by default 8 with a window, else 1. Memory is ``8 n_blocks p^2`` bytes
+    :param n_targets: Number m, below p, of the last columns whose products with each other are not kept
     """
 
     def __init__(
@@ -90,6 +178,7 @@ class StreamingMoments:
         names: Sequence[str] | None = None,
         window: int | None = None,
         n_blocks: int | None = None,
+        n_targets: int = 0,
     ) -> None:
         if isinstance(n_variables, bool) or not isinstance(n_variables, int | np.integer):
             raise TypeError(f"n_variables must be an integer, got {n_variables!r}")
@@ -104,11 +193,14 @@ class StreamingMoments:
             raise ValueError(f"n_blocks must be 1 or an even number, got {n_blocks!r}")
         if window is not None and not (isinstance(window, int | float | np.number) and 1 < n_blocks <= window < np.inf):
             raise ValueError(f"window must be None or at least {max(n_blocks, 2)} rows in at least 2 blocks, got {window!r}")
+        if not 0 <= n_targets < n_variables:
+            raise ValueError(f"n_targets must be at least 0 and below n_variables={n_variables}, got {n_targets!r}")
         self.n_variables = int(n_variables)
         self.half_life = half_life
         self.names = tuple(names) if names is not None else tuple(f"variable[{i}]" for i in range(n_variables))
         self.window = window
         self.n_blocks = n_blocks
+        self.n_targets = n_targets
         self.clear()
 
     def clear(self) -> None:
@@ -141,7 +233,7 @@ class StreamingMoments:
                 self._newest_rows = 0
             taken = int(min(len(rows), self._block_rows - self._newest_rows))
             before = self._blocks.pop() if self._newest_rows > 0 else None
-            self._blocks.append(with_rows(before, rows[:taken]))
+            self._blocks.append(with_rows(before, rows[:taken], self.n_targets))
             self._newest_rows += taken
             rows = rows[taken:]
 
@@ -161,7 +253,7 @@ class StreamingMoments:
         """Weigh old rows less; a block goes when its weight is nothing beside that of the new rows."""
         assert self.half_life is not None
         factor = 0.5 ** (n_new_rows / self.half_life)
-        self._blocks = [Moments(factor * block.count, block.mean, factor * block.comoment) for block in self._blocks]
+        self._blocks = [block.faded(factor) for block in self._blocks]
         while self._blocks and self._blocks[0].count < FORGOTTEN * n_new_rows:
             del self._blocks[0]
 
@@ -172,10 +264,10 @@ class StreamingMoments:
         if self.window is not None:
             del self._blocks[0]
         elif self.half_life is not None and self._block_rows * self.n_blocks > 2.0 * self.half_life:
-            self._blocks[:2] = [merge(self._blocks[:2])]
+            self._blocks[:2] = [merge(self._blocks[:2], into_first=True)]
         else:
             for i in range(self.n_blocks // 2):
-                self._blocks[i : i + 2] = [merge(self._blocks[i : i + 2])]
+                self._blocks[i : i + 2] = [merge(self._blocks[i : i + 2], into_first=True)]
             self._block_rows *= 2
 
     def _check_finite(self, rows: np.ndarray) -> None:
@@ -185,36 +277,34 @@ class StreamingMoments:
             row = int(np.flatnonzero(bad.any(axis=1))[0])
             raise ValueError(f"rows must be finite (below {LARGEST_VALUE:g}): first bad row {row}, bad variables {variables}")
 
-    def total(self) -> Moments:
-        """
-        :return: moments of all rows that are not forgotten
-        :raises ValueError: when no row has been seen
-        """
-        if not self._blocks:
-            raise ValueError("no rows have been seen yet: call update(rows) first")
-        return merge(self._blocks)
+    @property
+    def blocks(self) -> tuple[Moments, ...]:
+        """Moments of the blocks that hold rows, oldest first, at most ``n_blocks``; the next update changes them."""
+        return tuple(self._blocks)
 
     @property
     def n_filled(self) -> int:
         """Number of blocks that hold rows, at most ``n_blocks``."""
         return len(self._blocks)
 
-    def without_block(self, index: int) -> tuple[Moments, float]:
+    def total(self) -> Moments:
         """
-        :param index: Of a block, below ``n_filled``, which must be at least 2
-        :return: moments of the rows of all other blocks, and the share of the weight that this block has
+        :return: moments of all rows that are not forgotten
+        :raises ValueError: when no row has been seen
         """
-        # Not by subtraction: where a block has nearly all of a variable's variance, that would leave rounding errors
-        others = self._blocks[:index] + self._blocks[index + 1 :]
-        return merge(others), self._blocks[index].count / self.count
+        return merge(self._filled())
 
-    def leave_one_out(self) -> list[tuple[Moments, float]]:
-        """
-        For a block jackknife.
+    def _filled(self) -> list[Moments]:
+        if not self._blocks:
+            raise ValueError("no rows have been seen yet: call update(rows) first")
+        return self._blocks
 
-        :return: ``without_block`` of each block; empty while there are fewer than two
+    def spread(self) -> Spread:
         """
-        return [self.without_block(i) for i in range(self.n_filled)] if self.n_filled > 1 else []
+        :return: that of all rows that are not forgotten, for less than ``total`` costs
+        :raises ValueError: when no row has been seen
+        """
+        return merge_spread(self._filled())
 
     @property
     def count(self) -> float:
@@ -224,11 +314,11 @@ class StreamingMoments:
     @property
     def mean(self) -> np.ndarray:
         """Shape (p,)."""
-        return self.total().mean
+        return self.spread().mean
 
     def covariance(self) -> np.ndarray:
         """
-        :return: population covariance (divided by the count), shape (p, p)
+        :return: population covariance (divided by the count) of the columns that are no targets, shape (p - m, p - m)
         :raises ValueError: when no row has been seen
         """
         return self.total().covariance()
@@ -238,20 +328,16 @@ class StreamingMoments:
         :return: population standard deviation, shape (p,)
         :raises ValueError: when no row has been seen
         """
-        total = self.total()
-        return np.sqrt(np.diagonal(total.comoment) / total.count)
+        return self.spread().standard_deviation()
 
     @property
     def constant(self) -> np.ndarray:
         """Which columns do not move: standard deviation at most 1e-10 max(1, \\|mean\\|), boolean, shape (p,)."""
-        total = self.total()
-        deviation = np.sqrt(np.diagonal(total.comoment) / total.count)
-        return deviation <= CONSTANT_FLOOR * np.maximum(1.0, np.abs(total.mean))
+        return self.spread().constant
 
     def correlation(self) -> np.ndarray:
         """
-        :return: correlation matrix, shape (p, p); rows and columns of constant variables are zero, diagonal included
+        :return: correlation matrix of the columns that are no targets, shape (p - m, p - m); rows and columns of constant
+            variables are zero, diagonal included
         """
-        moving = ~self.constant
-        inverse = moving / np.where(moving, self.standard_deviation(), 1.0)
-        return self.covariance() * np.outer(inverse, inverse)
+        return self.total().correlation()

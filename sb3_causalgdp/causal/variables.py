@@ -1,3 +1,4 @@
+from collections import Counter
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,7 +26,7 @@ class TransitionVariables:
             if len(names) == 0:
                 raise ValueError(f"{argument} is empty: at least one name is needed")
             object.__setattr__(self, argument, tuple(names))
-        repeated = sorted({name for name in self.names if self.names.count(name) > 1})
+        repeated = sorted(name for name, count in Counter(self.names).items() if count > 1)
         if repeated:
             raise ValueError(f"state_names and action_names must give every column its own name, repeated: {repeated}")
 
@@ -57,6 +58,17 @@ class TransitionVariables:
     @property
     def reward(self) -> int:
         return self.n_variables - 1
+
+    @property
+    def causes_of_state(self) -> np.ndarray:
+        """Columns of (s, a), shape (n + d,)."""
+        return np.arange(self.n_states + self.n_actions)
+
+    @property
+    def causes_of_reward(self) -> np.ndarray:
+        """Columns of (s', a), shape (n + d,)."""
+        columns = np.arange(self.n_variables)
+        return np.concatenate([columns[self.next_state], columns[self.action]])
 
     @property
     def next_state_names(self) -> tuple[str, ...]:

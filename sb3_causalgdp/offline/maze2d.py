@@ -222,7 +222,7 @@ class PointSimulator:
 
 class Maze2dEnv(gym.Env[np.ndarray, np.ndarray], EzPickle):
     """
-    D4RL's maze2d-*-v1 with Gymnasium's interface: a fixed goal, starts everywhere, no termination.
+    D4RL's ``maze2d-*-v1`` with Gymnasium's interface: a fixed goal, starts everywhere, no termination.
 
     Differs from Gymnasium-Robotics' PointMaze in all of these. The reward is that of the state before the step, as in D4RL's
     datasets; D4RL's own simulator rewards the state after it, which shifts the rewards of an episode by one step.

@@ -26,57 +26,60 @@ def fed(rows, batch=100, **kwargs):
     return statistics
 
 
-def expand(z, products=True):
+def expand(z, basis="products"):
     """The formula, column by column."""
     b = np.clip(z, -5.0, 5.0)
-    columns = [*z.T, *(b**2).T, *np.sin(b).T, *np.tanh(b).T]
+    columns = [*z.T]
+    if basis != "linear":
+        columns += [*(b**2).T, *np.sin(b).T, *np.tanh(b).T]
     p = z.shape[1]
-    columns += [b[:, i] * b[:, j] for i in range(p) for j in range(i + 1, p)] if products else []
+    columns += [b[:, i] * b[:, j] for i in range(p) for j in range(i + 1, p)] if basis == "products" else []
     return np.stack(columns, axis=1)
 
 
-@pytest.fixture
-def expansion():
-    return BasisExpansion(np.array([1.0, -2.0, 0.5]), np.array([2.0, 0.5, 1.0]), products=True)
+@pytest.fixture(params=["linear", "additive", "products"])
+def expansion(request):
+    return BasisExpansion(np.array([1.0, -2.0, 0.5]), np.array([2.0, 0.5, 1.0]), request.param)
 
 
-@pytest.mark.parametrize("products", [True, False])
-def test_features_follow_the_formula(expansion, products):
-    expansion = BasisExpansion(expansion.location, expansion.scale, products)
+def test_features_follow_the_formula(expansion):
     inputs = 8.0 * np.random.default_rng(0).standard_normal((50, 3))
     z = (inputs - [1.0, -2.0, 0.5]) / [2.0, 0.5, 1.0]
     features = expansion.features(expansion.standardise(inputs))
-    np.testing.assert_allclose(features, expand(z, products))
+    np.testing.assert_allclose(features, expand(z, expansion.basis))
     assert np.abs(z).max() > 5.0 and features.shape == (50, expansion.n_features)
 
 
 def test_features_of_a_variable_are_those_that_change_with_it(expansion):
     z = np.random.default_rng(0).standard_normal((20, 3))
-    for variable in range(3):
+    for variable, of_variable in enumerate(expansion.features_of(np.arange(3))):
         moved = z.copy()
         moved[:, variable] += 0.3
         changed = (expansion.features(moved) != expansion.features(z)).any(axis=0)
-        np.testing.assert_array_equal(np.flatnonzero(changed), np.sort(expansion.features_of(variable)))
+        np.testing.assert_array_equal(np.flatnonzero(changed), np.sort(of_variable))
 
 
-@pytest.mark.parametrize("products", [True, False])
-def test_difference_is_that_of_the_features(expansion, products):
-    expansion = BasisExpansion(expansion.location, expansion.scale, products)
-    z = 3.0 * np.random.default_rng(0).standard_normal((20, 3))
-    for variable in range(3):
+@pytest.mark.parametrize("variables", [[0, 1, 2], [2, 0], []])
+def test_differences_are_those_of_the_features(expansion, variables):
+    z, half_steps = 3.0 * np.random.default_rng(0).standard_normal((20, 3)), np.array([0.4, 0.2, 1.0])
+    differences = expansion.differences(z, np.array(variables, dtype=int), half_steps)
+    features_of = expansion.features_of(np.array(variables, dtype=int))
+    assert differences.shape[:2] == (len(variables), 20) and len(features_of) == len(variables)
+    for variable, difference, of_variable in zip(variables, differences, features_of, strict=True):
         above, below = z.copy(), z.copy()
-        above[:, variable] += 0.4
-        below[:, variable] -= 0.4
-        expected = (expansion.features(above) - expansion.features(below))[:, expansion.features_of(variable)]
-        np.testing.assert_allclose(expansion.difference(z, variable, 0.4), expected, atol=1e-12)
+        above[:, variable] += half_steps[variable]
+        below[:, variable] -= half_steps[variable]
+        expected = (expansion.features(above) - expansion.features(below))[:, of_variable]
+        np.testing.assert_allclose(difference, expected, atol=1e-12)
 
 
+@pytest.mark.parametrize("expansion", ["products"], indirect=True)
 def test_subset_has_the_features_of_the_kept_inputs_alone(expansion):
     z = np.random.default_rng(0).standard_normal((20, 3))
     kept = np.array([0, 2])
     features = expansion.features(z)
     np.testing.assert_allclose(features[:, expansion.subset(kept, 4, True)], expand(z[:, kept]))
-    np.testing.assert_allclose(features[:, expansion.subset(kept, 4, False)], expand(z[:, kept], products=False))
+    np.testing.assert_allclose(features[:, expansion.subset(kept, 4, False)], expand(z[:, kept], "additive"))
     np.testing.assert_allclose(features[:, expansion.subset(kept, 2, False)], np.hstack([z[:, kept], z[:, kept] ** 2]))
     np.testing.assert_allclose(features[:, expansion.subset(kept, 1, False)], z[:, kept])
 
@@ -92,9 +95,12 @@ def test_moments_are_those_of_features_and_targets(batch):
         (statistics.reward, [3, 4, 2], [5]),
     ):
         z = (rows - first.mean(axis=0))[:, inputs] / first.std(axis=0)[inputs]
-        everything = np.hstack([expand(z), rows[:, target]])
-        np.testing.assert_allclose(moments.mean, everything.mean(axis=0), atol=1e-9)
-        np.testing.assert_allclose(moments.covariance(), np.cov(everything.T, ddof=0), atol=1e-9)
+        everything, total = np.hstack([expand(z), rows[:, target]]), moments.total()
+        covariance, n_features = np.cov(everything.T, ddof=0), 15
+        np.testing.assert_allclose(total.mean, everything.mean(axis=0), atol=1e-9)
+        np.testing.assert_allclose(total.covariance(), covariance[:n_features, :n_features], atol=1e-9)
+        np.testing.assert_allclose(total.cross / 600, covariance[:n_features, n_features:], atol=1e-9)
+        np.testing.assert_allclose(total.standard_deviation(), np.sqrt(np.diagonal(covariance)), atol=1e-9)
         assert moments.n_samples == 600
     np.testing.assert_array_equal(statistics.recent, rows[-256:])
 
@@ -201,23 +207,33 @@ def test_pickle_keeps_what_was_fed():
         assert PartialR2()(loaded, VARIABLES).masks.tolist() == PartialR2()(statistics, VARIABLES).masks.tolist()
 
 
-@pytest.mark.parametrize(("n_inputs", "products"), [(60, True), (61, False)])
-def test_there_are_products_up_to_sixty_inputs(n_inputs, products):
+@pytest.mark.parametrize(("n_inputs", "basis", "other"), [(60, "products", "additive"), (61, "additive", "products")])
+def test_there_are_products_up_to_sixty_inputs(n_inputs, basis, other):
     variables = TransitionVariables(tuple(f"s{i}" for i in range(n_inputs - 2)), ("a", "b"))
     statistics = BasisMoments(variables)
-    assert statistics.products is products
-    n_features = 4 * n_inputs + (n_inputs * (n_inputs - 1) // 2 if products else 0)
+    assert statistics.basis == basis
+    n_features = 4 * n_inputs + (n_inputs * (n_inputs - 1) // 2 if basis == "products" else 0)
     assert statistics.dynamics.n_variables == n_features + n_inputs - 2
-    assert BasisMoments(variables, products=not products, max_memory=1e9).products is not products
+    assert BasisMoments(variables, basis=other, max_memory=1e9).basis == other
 
 
 def test_the_memory_limit_takes_blocks_away_and_then_is_an_error():
-    # 15 features, 17 and 16 columns: 4360 bytes a block
-    assert [BasisMoments(VARIABLES, max_memory=size).dynamics.n_blocks for size in (8 * 4360, 7 * 4360, 2 * 4360)] == [8, 6, 2]
-    with pytest.raises(ValueError, match=r"15 features of 3 states and actions .* use products=False"):
-        BasisMoments(VARIABLES, max_memory=2 * 4360 - 1)
-    with pytest.raises(ValueError, match="more memory"):
-        BasisMoments(VARIABLES, products=False, max_memory=1000)
+    # Products of 15 features with each other, twice, and with 2 and 1 targets: 3960 bytes a block
+    assert [BasisMoments(VARIABLES, max_memory=size).dynamics.n_blocks for size in (8 * 3960, 7 * 3960, 2 * 3960)] == [8, 6, 2]
+    with pytest.raises(ValueError, match=r"15 features of 3 states and actions .* use basis='additive', or"):
+        BasisMoments(VARIABLES, max_memory=2 * 3960 - 1)
+    with pytest.raises(ValueError, match="use basis='linear', or give it more memory"):
+        BasisMoments(VARIABLES, basis="additive", max_memory=1000)
+    with pytest.raises(ValueError, match="MB: give it more memory"):
+        BasisMoments(VARIABLES, basis="linear", max_memory=100)
+
+
+def test_memory_is_that_of_the_blocks():
+    statistics = fed(draw(16_000), max_memory=8 * 3960)
+    arrays = [
+        array for part in (statistics.dynamics, statistics.reward) for b in part.blocks for array in (b.comoment, b.cross)
+    ]
+    assert statistics.dynamics.n_filled == 8 and sum(array.nbytes for array in arrays) == 8 * 3960
 
 
 def test_a_long_batch_needs_little_memory_beside_itself():

@@ -335,10 +335,10 @@ def test_rows_are_read_again_when_their_scale_has_moved(tmp_path):
 
 
 def test_kwargs():
-    items = ["threshold=0.1", "products=False", "max_memory=1e8", "on_degenerate=raise", '{"spread": 1, "products": null}']
-    expected = {"threshold": 0.1, "products": None, "max_memory": 1e8, "on_degenerate": "raise", "spread": 1}
+    items = ["threshold=0.1", "basis=linear", "max_memory=1e8", "on_degenerate=raise", '{"spread": 1, "basis": "auto"}']
+    expected = {"threshold": 0.1, "basis": "auto", "max_memory": 1e8, "on_degenerate": "raise", "spread": 1}
     assert parse_kwargs(items) == expected
-    assert parse_kwargs(["products=False"]) == {"products": False}
+    assert parse_kwargs(["standardize=False"]) == {"standardize": False}
 
 
 # Mistakes ---------------------------------------------------------------------------------------------------------------

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from sb3_causalgdp.causal import StreamingMoments, TransitionVariables
+from sb3_causalgdp.causal.moments import merge, merge_spread
 
 
 def moments_of(rows, batch=64, **kwargs):
@@ -11,6 +12,12 @@ def moments_of(rows, batch=64, **kwargs):
     for start in range(0, len(rows), batch):
         moments.update(rows[start : start + batch])
     return moments
+
+
+def leave_one_out(moments):
+    """Moments of all blocks but one, and the share of the weight that this one has."""
+    blocks = moments.blocks
+    return [(merge([*blocks[:i], *blocks[i + 1 :]]), block.count / moments.count) for i, block in enumerate(blocks)]
 
 
 @pytest.mark.parametrize("batch", [1, 7, 1000])
@@ -85,7 +92,7 @@ def test_half_life_with_blocks_weighs_rows_by_their_age(window):
 @pytest.mark.parametrize("n_blocks", [4, 8])
 def test_half_life_leaves_weight_in_several_blocks(n_blocks):
     moments = moments_of(np.random.default_rng(0).normal(size=(20_000, 2)), batch=100, half_life=500, n_blocks=n_blocks)
-    shares = [share for _, share in moments.leave_one_out()]
+    shares = [share for _, share in leave_one_out(moments)]
     assert len(shares) == n_blocks
     np.testing.assert_allclose(sum(shares), 1.0)
     assert max(shares) < 0.8
@@ -97,12 +104,12 @@ def test_rows_of_no_weight_are_gone():
     rows = np.random.default_rng(1).normal(size=(5000, 2))
     moments.update(rows)
     assert_of_rows(moments, rows)
-    assert all(0.0 < share < 1.0 for _, share in moments.leave_one_out())
+    assert all(0.0 < share < 1.0 for _, share in leave_one_out(moments))
 
 
 def test_leaving_a_block_out_equals_numpy_on_the_other_rows():
     rows = np.random.default_rng(0).normal(size=(150, 3)) + np.linspace(0.0, 5.0, 150)[:, None]
-    parts = moments_of(rows, batch=11, n_blocks=4).leave_one_out()
+    parts = leave_one_out(moments_of(rows, batch=11, n_blocks=4))
     first_rows = [0, 64, 128, 150]  # two blocks of 8 rows, doubled three times, and one that is not full
     assert len(parts) == 3
     for i, (rest, share) in enumerate(parts):
@@ -111,19 +118,57 @@ def test_leaving_a_block_out_equals_numpy_on_the_other_rows():
         assert share == pytest.approx(len(block) / 150)
 
 
-def test_one_block_cannot_be_left_out():
-    assert StreamingMoments(2, n_blocks=4).leave_one_out() == []
-    assert moments_of(np.ones((5, 2)), n_blocks=4).leave_one_out() == []
-    assert moments_of(np.ones((500, 2))).leave_one_out() == []
+def test_there_is_a_block_for_the_first_rows_and_none_without():
+    assert StreamingMoments(2, n_blocks=4).blocks == ()
+    assert len(moments_of(np.ones((5, 2)), n_blocks=4).blocks) == 1
+    assert len(moments_of(np.ones((500, 2))).blocks) == 1
 
 
 def test_a_block_with_all_of_a_variance_leaves_none_behind():
     rows = np.random.default_rng(0).normal(size=(512, 2))
     rows[:, 1] = 0.1
     rows[70:80, 1] = 1e6
-    parts = moments_of(rows, n_blocks=8).leave_one_out()
+    parts = leave_one_out(moments_of(rows, n_blocks=8))
     left = [rest.covariance()[1, 1] for rest, _ in parts]
     assert left[1] == 0.0 and min(left[:1] + left[2:]) > 0.0
+    assert [rest.standard_deviation()[1] ** 2 for rest, _ in parts] == pytest.approx(left)
+
+
+@pytest.mark.parametrize("kwargs", [{}, {"half_life": 200.0}, {"window": 400, "n_blocks": 4}, {"n_blocks": 8}])
+@pytest.mark.parametrize("batch", [1, 70])
+def test_targets_have_no_products_with_each_other(batch, kwargs):
+    rows = np.random.default_rng(0).normal(size=(1000, 5)) @ np.random.default_rng(1).normal(size=(5, 5)) + 2.0
+    full, slim = moments_of(rows, batch, **kwargs), moments_of(rows, batch, n_targets=2, **kwargs)
+    covariance, total = full.covariance(), slim.total()
+    np.testing.assert_allclose(slim.covariance(), covariance[:3, :3], rtol=1e-9)
+    np.testing.assert_allclose(slim.correlation(), full.correlation()[:3, :3], rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(total.cross / total.count, covariance[:3, 3:], rtol=1e-9)
+    np.testing.assert_allclose(total.squares / total.count, np.diagonal(covariance), rtol=1e-9)
+    np.testing.assert_allclose(slim.mean, full.mean)
+    assert slim.constant.tolist() == [False] * 5 and total.cross.shape == (3, 2)
+
+
+@pytest.mark.parametrize("half_life", [None, 150.0])
+def test_the_spread_is_that_of_the_moments(half_life):
+    moments = moments_of(np.random.default_rng(0).normal(size=(700, 3)) + 5.0, n_blocks=4, half_life=half_life)
+    spread, total = moments.spread(), moments.total()
+    assert spread.count == pytest.approx(total.count)
+    np.testing.assert_allclose(spread.mean, total.mean)
+    np.testing.assert_allclose(spread.squares, np.diagonal(total.comoment), rtol=1e-12)
+    rest = merge_spread(moments.blocks[1:])
+    np.testing.assert_allclose(rest.squares, np.diagonal(merge(moments.blocks[1:]).comoment), rtol=1e-12)
+
+
+def test_merging_into_the_first_gives_the_same_and_leaves_the_others_alone():
+    blocks = moments_of(np.random.default_rng(0).normal(size=(700, 3)), n_blocks=4).blocks
+    kept = [block.comoment.copy() for block in blocks]
+    merged = merge(blocks)
+    for block, comoment in zip(blocks, kept, strict=True):
+        np.testing.assert_array_equal(block.comoment, comoment)
+    into = merge(blocks, into_first=True)
+    np.testing.assert_array_equal(into.comoment, merged.comoment)
+    assert into.comoment is blocks[0].comoment
+    np.testing.assert_array_equal(blocks[1].comoment, kept[1])
 
 
 @pytest.mark.parametrize("batch", [1, 100])
@@ -131,7 +176,7 @@ def test_blocks_stay_accurate_with_a_large_mean_and_a_small_deviation(batch):
     rows = 1e6 + 1e-3 * np.random.default_rng(0).normal(size=(3000, 2))
     moments = moments_of(rows, batch, n_blocks=8)
     everything = [(moments, rows)]
-    for i, (rest, _) in enumerate(moments.leave_one_out()):
+    for i, (rest, _) in enumerate(leave_one_out(moments)):
         everything.append((rest, np.delete(rows, np.arange(512 * i, min(512 * (i + 1), 3000)), axis=0)))
     assert len(everything) == 7
     for estimate, kept in everything:
@@ -205,7 +250,7 @@ def test_pickle_keeps_the_moments(kwargs):
     loaded.update(np.ones((3, 2)))
     moments.update(np.ones((3, 2)))
     np.testing.assert_array_equal(loaded.covariance(), moments.covariance())
-    assert len(loaded.leave_one_out()) == len(moments.leave_one_out())
+    assert len(loaded.blocks) == len(moments.blocks)
 
 
 @pytest.mark.parametrize("shape", [(3,), (2, 4), (1, 2, 3)])
@@ -232,6 +277,8 @@ def test_no_rows_is_an_error():
         ({"n_variables": 2, "window": 7}, ValueError, "window"),
         ({"n_variables": 2, "window": 7, "n_blocks": 1}, ValueError, "window"),
         ({"n_variables": 2, "window": "1e5"}, ValueError, "window"),
+        ({"n_variables": 2, "n_targets": 2}, ValueError, "n_targets"),
+        ({"n_variables": 2, "n_targets": -1}, ValueError, "n_targets"),
     ],
 )
 def test_bad_arguments_are_errors(kwargs, error, message):

@@ -7,7 +7,15 @@ import pytest
 from sklearn.linear_model import Lasso
 from sklearn.metrics import roc_auc_score
 
-from sb3_causalgdp.causal import DISCOVERY_METHODS, CausalGraph, StreamingMoments, TransitionVariables, make_discovery
+from sb3_causalgdp.causal import (
+    DISCOVERY_METHODS,
+    CausalGraph,
+    StreamingMoments,
+    TransitionVariables,
+    discover,
+    make_discovery,
+    make_statistics,
+)
 from sb3_causalgdp.causal.discovery.acyclic import acyclicity, is_acyclic, without_cycles
 from sb3_causalgdp.causal.discovery.lasso import solve_lasso_gram
 from sb3_causalgdp.causal.discovery.notears import Notears
@@ -242,6 +250,35 @@ def test_standard_errors_are_the_spread_over_repetitions(standardize):
     ratio = np.mean(errors, axis=0)[steady] / np.std(effects, axis=0)[steady]
     assert steady.sum() >= 8 and 0.8 < ratio.mean() < 1.2
     assert np.mean(errors, axis=0).min() > 0
+
+
+def test_standard_errors_are_there_when_asked_for_or_with_a_window():
+    variables, rows, _ = linear_system(seed=0, n_rows=500)
+    assert discover("notears", rows, variables).standard_errors is None
+    asked = discover("notears", rows, variables, standard_errors=True)
+    method = Notears()
+    statistics = make_statistics(method, variables, window=400)
+    statistics.update(rows)
+    for graph in (asked, method(statistics, variables)):
+        assert graph.standard_errors.min() > 0.0
+    np.testing.assert_allclose(asked.effects, discover("notears", rows, variables).effects, atol=1e-9)
+
+
+@pytest.mark.parametrize("sparsity", [0.0, 0.05])
+def test_standard_errors_are_about_those_of_actual_refits_without_each_block(sparsity):
+    variables, rows, _ = linear_system(seed=0, n_rows=4096, n_states=4, n_actions=2)
+    graph = discover("notears", rows, variables, sparsity=sparsity, standard_errors=True)
+    parts = [
+        discover("notears", np.delete(rows, np.arange(i, i + 512), axis=0), variables, sparsity=sparsity)
+        for i in range(0, 4096, 512)
+    ]
+    effects = np.stack([part.effects for part in parts])
+    expected = np.sqrt(((effects - effects.mean(axis=0)) ** 2).sum(axis=0) * 7 / 8)
+    # One step keeps the signs: rows in which the L1 norm lets other edges in without some block are not compared
+    steady = (np.sign(effects) == np.sign(graph.effects)).all(axis=(0, 2))
+    compared = steady[:, None] & (graph.effects != 0.0)
+    assert compared.sum() >= 4
+    np.testing.assert_allclose(graph.standard_errors[compared], expected[compared], rtol=0.05)
 
 
 def test_one_block_gives_no_standard_errors():

@@ -295,7 +295,8 @@ def test_bad_arguments_are_errors(call, message):
 
 @pytest.mark.parametrize("missing", ["matplotlib.figure", "networkx"])
 def test_missing_library_says_what_to_install(monkeypatch, missing):
-    monkeypatch.delitem(sys.modules, "sb3_causalgdp.causal.plots")
+    for name in ("plots", "figures", "heat_maps", "layered_graphs", "history_plots"):
+        monkeypatch.delitem(sys.modules, f"sb3_causalgdp.causal.{name}")
     monkeypatch.setitem(sys.modules, missing, None)
     with pytest.raises(ImportError, match=r'pip install "sb3_causalgdp\[plots\]"'):
         make_graph().plot()

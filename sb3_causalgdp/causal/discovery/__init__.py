@@ -27,6 +27,7 @@ __all__ = [
     "discover",
     "make_discovery",
     "make_statistics",
+    "min_rows",
 ]
 
 
@@ -43,7 +44,7 @@ class DiscoveryMethod(Protocol):
     Turns statistics of transitions into a causal graph; any callable of this signature will do.
 
     A method that needs more than :class:`StreamingMoments` has a method ``make_statistics`` as well, with the arguments of
-    :func:`make_statistics` behind the first.
+    :func:`make_statistics` behind the first; and one that cannot do with any number of rows a method ``min_rows(variables)``.
     """
 
     def __call__(
@@ -97,6 +98,15 @@ def make_statistics(
     if hasattr(method, "make_statistics"):
         return method.make_statistics(variables, half_life, window)
     return StreamingMoments(variables.n_variables, half_life, variables.names, window)
+
+
+def min_rows(method: DiscoveryMethod, variables: TransitionVariables) -> int:
+    """
+    :param method: A discovery method
+    :param variables: Names and order of the variables
+    :return: number of rows that it needs for a graph, 1 where it does not say
+    """
+    return method.min_rows(variables) if hasattr(method, "min_rows") else 1
 
 
 def discover(

@@ -1,10 +1,9 @@
 import warnings
-from datetime import datetime, timezone
 from typing import Any
 
 import numpy as np
 
-from sb3_causalgdp.causal.degenerate import find_degeneracy, variance_inflation
+from sb3_causalgdp.causal.degenerate import find_degeneracy, find_limits
 from sb3_causalgdp.causal.discovery.lasso import least_squares_gram
 from sb3_causalgdp.causal.discovery.notears import weight_masks
 from sb3_causalgdp.causal.graph import CausalGraph
@@ -79,6 +78,13 @@ class DirectLingam:
             )
         return RecentRows(variables, half_life, window, default_window=self.window)
 
+    def min_rows(self, variables: TransitionVariables) -> int:
+        """
+        :param variables: Names and order of the variables
+        :return: number of rows that a graph needs
+        """
+        return 2 * variables.n_states + variables.n_actions + 10
+
     def __call__(
         self, statistics: RecentRows, variables: TransitionVariables, previous: CausalGraph | None = None
     ) -> CausalGraph:
@@ -91,39 +97,35 @@ class DirectLingam:
         :return: the graph; constant variables have no edges
         :raises ValueError: on fewer than 2 n + d + 10 rows, or when the arguments are not about the same variables
         """
-        n_states, n_inputs = variables.n_states, variables.n_states + variables.n_actions
-        rows = checked_rows(statistics, variables, "direct_lingam", n_states + n_inputs + 10)
+        n_states = variables.n_states
+        rows = checked_rows(statistics, variables, "direct_lingam", self.min_rows(variables))
         newest = RecentRows(variables)
         newest.update(rows)
-        moving = ~newest.moments.constant
-        rows = (rows - newest.moments.mean) * moving / np.where(moving, newest.moments.standard_deviation(), 1.0)
-        inputs = np.arange(n_inputs)
+        moments = newest.moments.total()
+        moving = ~moments.constant
+        rows = (rows - moments.mean) * moving / np.where(moving, moments.standard_deviation(), 1.0)
+        inputs, after = variables.causes_of_state, variables.causes_of_reward
         targets = np.arange(variables.n_variables)[variables.next_state]
-        after = np.concatenate([targets, inputs[variables.action]])
-        correlation = newest.moments.correlation()
-        of_now, of_after = (find_degeneracy(correlation[np.ix_(columns, columns)]) for columns in (inputs, after))
-        weights = np.zeros((n_states + 1, n_inputs))
+        limits = find_limits(moments.correlation(), variables)
+        of_now, of_after = limits.of_dynamics, limits.of_reward
+        weights = np.zeros((n_states + 1, len(inputs)))
         weights[:n_states, of_now.kept] = self._dynamics(rows, inputs[of_now.kept], targets, moving[targets])
         weights[-1, of_after.kept] = _adaptive_lasso(rows, after[of_after.kept], variables.reward)
         for part, degeneracy in ((slice(0, n_states), of_now), (slice(n_states, None), of_after)):
             for variable, (stand_in, sign) in degeneracy.stand_in.items():
                 weights[part, variable] = sign * weights[part, stand_in]
         masks = weight_masks(weights, self.edge_threshold, self.mask_scale)
-        names = np.array(variables.names)
         return CausalGraph(
             variables,
             np.concatenate([of_now.share(masks[:n_states]), of_after.share(masks[n_states:])]),
             weights,
             method="direct_lingam",
             n_samples=statistics.n_samples,
-            action_vif=variance_inflation(correlation[:n_inputs, :n_inputs])[n_states:],
             r_squared=np.append(
                 _r_squared(rows[:, targets], rows[:, inputs[of_now.kept]] @ weights[:n_states, of_now.kept].T),
                 _r_squared(rows[:, [variables.reward]], rows[:, after[of_after.kept]] @ weights[-1:, of_after.kept].T),
             ),
-            constant_variables=tuple(names[~moving].tolist()),
-            duplicated_variables=of_now.names_of_groups((*variables.state_names, *variables.action_names)),
-            found_at=datetime.now(timezone.utc).isoformat(timespec="seconds"),
+            **limits.remarks(),
         )
 
     def _dynamics(self, rows: np.ndarray, inputs: np.ndarray, targets: np.ndarray, moving: np.ndarray) -> np.ndarray:

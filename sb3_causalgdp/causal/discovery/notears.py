@@ -1,26 +1,27 @@
 import warnings
-from datetime import datetime, timezone
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 
-from sb3_causalgdp.causal.degenerate import Degeneracy, find_degeneracy, variance_inflation
+from sb3_causalgdp.causal.degenerate import Degeneracy, find_limits
 from sb3_causalgdp.causal.discovery.acyclic import notears, without_cycles
-from sb3_causalgdp.causal.discovery.lasso import least_squares_gram, solve_lasso_gram
+from sb3_causalgdp.causal.discovery.lasso import least_squares_gram, newton_steps, product, solve_lasso_gram
 from sb3_causalgdp.causal.graph import CausalGraph
 from sb3_causalgdp.causal.jackknife import jackknife_error
-from sb3_causalgdp.causal.moments import StreamingMoments
+from sb3_causalgdp.causal.moments import Moments, StreamingMoments, merge_spread
 from sb3_causalgdp.causal.variables import TransitionVariables
+
+TINY = np.finfo(np.float64).tiny
 
 
 class _Part(NamedTuple):
     """Some rows of the graph: those of the m targets, from p inputs."""
 
-    weights: np.ndarray  # (m, p)
     masks: np.ndarray  # (m, p)
+    weights: np.ndarray  # (m, p)
     r_squared: np.ndarray  # (m,)
     standard_errors: np.ndarray | None  # (m, p)
-    degeneracy: Degeneracy
 
 
 def weight_masks(weights: np.ndarray, edge_threshold: float, mask_scale: float) -> np.ndarray:
@@ -53,8 +54,8 @@ class Notears:
     ``w^2 / (w^2 + mask_scale^2)``, which is half at \\|w\\| = ``mask_scale`` and, by default, 0.90 at 0.15 and 0.99 at 0.5.
     Linearly dependent causes share a mask, the largest among them.
 
-    Standard errors come from moments of at least two blocks (``StreamingMoments(n_blocks=8)``), by a jackknife that takes one
-    Newton step from the solution, at its support and signs; that of a closed edge is the error of what the L1 norm set to 0.
+    Standard errors come from moments of at least two blocks, by a jackknife that takes one Newton step from the solution, at
+    its support and signs; that of a closed edge is the error of what the L1 norm set to 0.
 
     :param sparsity: Weight of the L1 norm, not negative; in units of a correlation when ``standardize``. 0 is least squares,
         which has a closed form
@@ -66,6 +67,8 @@ class Notears:
         variables' units decide what is sparse and, among simultaneous variables, what causes what (Reisach et al., 2021,
         https://arxiv.org/abs/2102.13647)
     :param instantaneous: Whether edges inside s_{t+1} are estimated; costs hundreds of matrix exponentials of size n
+    :param standard_errors: Whether rows are kept in eight blocks, for standard errors, which doubles the time of a graph; not
+        with ``instantaneous``. With a window there are blocks, and so standard errors, in any case
     """
 
     def __init__(
@@ -77,6 +80,7 @@ class Notears:
         tolerance: float = 1e-5,
         standardize: bool = True,
         instantaneous: bool = False,
+        standard_errors: bool = False,
     ) -> None:
         for name, number, zero_allowed in (
             ("sparsity", sparsity, True),
@@ -96,8 +100,21 @@ class Notears:
         self.tolerance = tolerance
         self.standardize = standardize
         self.instantaneous = instantaneous
+        self.standard_errors = standard_errors
         self.instantaneous_weights: np.ndarray | None = None
         """Of the last graph: row j holds the direct weights of s'_k on s'_j in standardised units, without cycles, (n, n)."""
+
+    def make_statistics(
+        self, variables: TransitionVariables, half_life: float | None = None, window: int | None = None
+    ) -> StreamingMoments:
+        """
+        :param variables: Names and order of the variables
+        :param half_life: Number of new rows after which an old row weighs half; None weighs all alike
+        :param window: Number of newest rows that are kept; None keeps all
+        :return: what this method gathers
+        """
+        n_blocks = 8 if self.standard_errors else None
+        return StreamingMoments(variables.n_variables, half_life, variables.names, window, n_blocks)
 
     def __call__(
         self, moments: StreamingMoments, variables: TransitionVariables, previous: CausalGraph | None = None
@@ -112,27 +129,33 @@ class Notears:
         :raises ValueError: on fewer than n + d + 2 rows, or when the arguments are not about the same variables
         """
         self._check(moments, variables, previous)
-        n_states, n_inputs = variables.n_states, variables.n_states + variables.n_actions
-        now = np.arange(n_inputs)
-        after = np.concatenate([np.arange(variables.next_state.start, variables.next_state.stop), now[variables.action]])
-        start = np.zeros((n_states + 1, n_inputs)) if previous is None else previous.effects
+        shape = (variables.n_states + 1, variables.n_states + variables.n_actions)
+        start = np.zeros(shape) if previous is None else previous.effects
         problem = _Standardised(moments, self.standardize)
-        dynamics = self._solve(problem, now, after[:n_states], start[:-1], self.instantaneous)
-        reward = self._solve(problem, after, np.array([variables.reward]), start[-1:])
-        known = dynamics.standard_errors is not None and reward.standard_errors is not None
+        limits = find_limits(problem.correlation, variables)
+        now, after, reward = variables.causes_of_state, variables.causes_of_reward, np.array([variables.reward])
+        parts = (
+            self._solve(problem, now, after[: variables.n_states], limits.of_dynamics, start[:-1], self.instantaneous),
+            self._solve(problem, after, reward, limits.of_reward, start[-1:]),
+        )
+        errors = [part.standard_errors for part in parts if part.standard_errors is not None]
         return CausalGraph(
             variables,
-            np.concatenate([dynamics.masks, reward.masks]),
-            np.concatenate([dynamics.weights, reward.weights]),
+            np.concatenate([part.masks for part in parts]),
+            np.concatenate([part.weights for part in parts]),
             method="notears",
             n_samples=moments.n_samples,
-            standard_errors=np.concatenate([dynamics.standard_errors, reward.standard_errors]) if known else None,
-            r_squared=np.concatenate([dynamics.r_squared, reward.r_squared]),
-            action_vif=variance_inflation(problem.correlation[:n_inputs, :n_inputs])[n_states:],
-            found_at=datetime.now(timezone.utc).isoformat(timespec="seconds"),
-            constant_variables=tuple(np.array(variables.names)[moments.constant].tolist()),
-            duplicated_variables=dynamics.degeneracy.names_of_groups(variables.names),
+            standard_errors=np.concatenate(errors) if len(errors) == len(parts) else None,
+            r_squared=np.concatenate([part.r_squared for part in parts]),
+            **limits.remarks(),
         )
+
+    def min_rows(self, variables: TransitionVariables) -> int:
+        """
+        :param variables: Names and order of the variables
+        :return: number of rows that a graph needs
+        """
+        return variables.n_states + variables.n_actions + 2
 
     def mask(self, weights: np.ndarray) -> np.ndarray:
         """
@@ -144,7 +167,7 @@ class Notears:
     def _check(self, moments: StreamingMoments, variables: TransitionVariables, previous: CausalGraph | None) -> None:
         if moments.n_variables != variables.n_variables:
             raise ValueError(f"moments must hold {variables.n_variables} variables, got {moments.n_variables}")
-        needed = variables.n_states + variables.n_actions + 2
+        needed = self.min_rows(variables)
         if moments.n_samples < needed:
             raise ValueError(f"moments must hold at least {needed} rows (states + actions + 2), got {moments.n_samples}")
         if previous is not None and previous.variables != variables:
@@ -155,41 +178,44 @@ class Notears:
         problem: "_Standardised",
         inputs: np.ndarray,
         targets: np.ndarray,
+        degeneracy: Degeneracy,
         initial: np.ndarray,
         instantaneous: bool = False,
     ) -> _Part:
         """
         :param inputs: Columns of the p possible causes
         :param targets: Columns of the m effects
+        :param degeneracy: What cannot be told apart among the inputs
         :param initial: Start in standardised units, shape (m, p)
         :param instantaneous: Whether the targets may cause each other
         """
-        degeneracy = find_degeneracy(problem.correlation[np.ix_(inputs, inputs)])
         moves = np.flatnonzero(problem.moving[targets])
         free, targets = inputs[degeneracy.kept], targets[moves]
+        chosen = np.ix_(moves, degeneracy.kept)
+        units = problem.to_standardised(targets, free)
         gram, cross = problem.second_moments(free, free), problem.second_moments(free, targets)
-        among = np.zeros((len(targets), len(targets)))
+        start, errors = initial[chosen] / units, None
         if instantaneous:
             among = self._among(problem.second_moments(targets, targets), gram, cross)
             self.instantaneous_weights = np.zeros((len(initial), len(initial)))
             self.instantaneous_weights[np.ix_(moves, moves)] = among * problem.to_standardised(targets, targets)
-        through = np.linalg.inv(np.eye(len(targets)) - among)
-        units = problem.to_standardised(targets, free)
-        start = np.linalg.solve(through, initial[np.ix_(moves, degeneracy.kept)] / units)
-        direct = self._lasso(gram, cross @ np.linalg.inv(through).T, start)
-        chosen = np.ix_(moves, degeneracy.kept)
+            to_direct = np.eye(len(targets)) - among
+            total = np.linalg.solve(to_direct, self._lasso(gram, cross @ to_direct.T, to_direct @ start))
+        else:
+            total = self._lasso(gram, cross, start)
+            errors = problem.jackknife(free, targets, gram, cross, total, self.sparsity)
         weights, r_squared = np.zeros_like(initial), np.zeros(len(initial))
-        weights[chosen] = total = (through @ direct) * units
-        r_squared[moves] = problem.r_squared(free, targets, total)
-        errors = None
-        if not instantaneous and (changes := problem.jackknife(free, targets, direct)) is not None:
-            errors = np.zeros_like(initial)
-            errors[chosen] = changes * units
+        weights[chosen] = total * units
+        r_squared[moves] = problem.r_squared(targets, gram, cross, total)
+        standard_errors = None
+        if errors is not None:
+            standard_errors = np.zeros_like(initial)
+            standard_errors[chosen] = errors * units
         for variable, (stand_in, sign) in degeneracy.stand_in.items():
             weights[:, variable] = sign * weights[:, stand_in]
-            if errors is not None:
-                errors[:, variable] = errors[:, stand_in]
-        return _Part(weights, degeneracy.share(self.mask(weights)), r_squared, errors, degeneracy)
+            if standard_errors is not None:
+                standard_errors[:, variable] = standard_errors[:, stand_in]
+        return _Part(degeneracy.share(self.mask(weights)), weights, r_squared, standard_errors)
 
     def _lasso(self, gram: np.ndarray, cross: np.ndarray, initial: np.ndarray) -> np.ndarray:
         solution = solve_lasso_gram(gram, cross, self.sparsity, initial.T, self.max_iterations, self.tolerance)
@@ -209,54 +235,73 @@ class _Standardised:
     """Second moments in the units in which the problem is solved: all with deviation 1, or the variables' own."""
 
     def __init__(self, moments: StreamingMoments, standardize: bool) -> None:
-        self.moments = moments
-        self.moving = ~moments.constant
-        self.correlation = moments.correlation()
-        self.deviation = np.where(self.moving, moments.standard_deviation(), 1.0)
+        total = moments.total()
+        self.blocks = moments.blocks
+        self.shares = np.array([block.count for block in self.blocks]) / total.count
+        self.mean = total.mean
+        self.moving = ~total.constant
+        self.correlation = total.correlation()
+        self.deviation = np.where(self.moving, total.standard_deviation(), 1.0)
+        self.is_standard = standardize
         self.scale = np.ones_like(self.deviation) if standardize else self.deviation
 
     def second_moments(self, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
-        return self.correlation[np.ix_(rows, columns)] * np.outer(self.scale[rows], self.scale[columns])
+        moments = self.correlation[rows][:, columns]
+        return moments if self.is_standard else moments * np.outer(self.scale[rows], self.scale[columns])
 
     def to_standardised(self, targets: np.ndarray, inputs: np.ndarray) -> np.ndarray:
         """Factors that bring weights into standardised units, shape (m, p)."""
         return np.outer(1.0 / self.scale[targets], self.scale[inputs])
 
-    def r_squared(self, inputs: np.ndarray, targets: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    def r_squared(self, targets: np.ndarray, gram: np.ndarray, cross: np.ndarray, weights: np.ndarray) -> np.ndarray:
         """
-        :param weights: In standardised units, shape (m, p)
+        :param weights: In the problem's units, shape (m, p)
         :return: 1 - residual variance / variance, shape (m,)
         """
-        twice_cross = 2.0 * self.correlation[np.ix_(targets, inputs)] - weights @ self.correlation[np.ix_(inputs, inputs)]
-        return np.clip((weights * twice_cross).sum(axis=1), 0.0, 1.0)
+        explained = np.einsum("ij,ij->i", weights, 2.0 * cross.T - product(weights, gram))
+        return np.clip(explained / self.scale[targets] ** 2, 0.0, 1.0)
 
-    def jackknife(self, inputs: np.ndarray, targets: np.ndarray, weights: np.ndarray) -> np.ndarray | None:
+    def jackknife(
+        self,
+        inputs: np.ndarray,
+        targets: np.ndarray,
+        gram: np.ndarray,
+        cross: np.ndarray,
+        weights: np.ndarray,
+        sparsity: float,
+    ) -> np.ndarray | None:
         """
         :param weights: Solution in the problem's units, shape (m, p)
+        :param sparsity: Weight of the L1 norm
         :return: standard errors of the weights, shape (m, p); None when there are not two blocks
         """
-        parts = self.moments.leave_one_out()
-        if not parts:
+        if len(self.blocks) < 2:
             return None
-        inverse_scale = self.scale / self.deviation
-        columns = np.concatenate([inputs, targets])
-        residual_of = np.hstack([weights, -np.eye(len(targets))])
-        everything = self.second_moments(columns, columns)
-        gram = everything[: len(inputs), : len(inputs)]
-        gradients = np.empty((len(parts), *weights.shape))
-        units = np.empty_like(gradients)
-        for gradient, unit, (rest, _) in zip(gradients, units, parts, strict=True):
-            factor = inverse_scale[columns]
-            covariance = rest.covariance()[np.ix_(columns, columns)] * np.outer(factor, factor)
-            gradient[:] = residual_of @ (covariance - everything)[:, : len(inputs)]
-            # A standard deviation, the unit of an effect, is an estimate as well
-            deviation = np.sqrt(np.diagonal(covariance) / np.diagonal(everything))
-            unit[:] = deviation[: len(inputs)] / np.maximum(deviation[len(inputs) :, None], np.finfo(np.float64).tiny)
-        changes = np.zeros_like(gradients)
-        for target, row in enumerate(weights):
-            support, closed = np.flatnonzero(row), np.flatnonzero(row == 0.0)
-            slopes = gradients[:, target].T
-            changes[:, target, closed] = -(slopes[closed] / np.diagonal(gram)[closed, None]).T
-            if len(support):
-                changes[:, target, support] = -least_squares_gram(gram[np.ix_(support, support)], slopes[support]).T
-        return jackknife_error(weights, list((weights + changes) * units), [share for _, share in parts])
+        whole, gradients = product(weights, gram) - cross.T, []
+        for block, share, deviation in zip(self.blocks, self.shares, self._deviations_without, strict=True):
+            gradients.append(share / (1.0 - share) * (whole - self._gradient(block, inputs, targets, weights)))
+            if self.is_standard:
+                # The weight of the L1 norm is in units of a correlation, of the other blocks'
+                gradients[-1] += sparsity * (np.outer(deviation[targets], deviation[inputs]) - 1.0) * np.sign(weights)
+        slopes = np.stack(gradients).transpose(2, 1, 0)
+        changes = -newton_steps(gram, weights.T != 0.0, slopes).transpose(2, 1, 0)
+        # A standard deviation, the unit of an effect, is an estimate as well
+        units = [d[inputs] / np.maximum(d[targets, None], TINY) for d in self._deviations_without]
+        return jackknife_error(weights, [(weights + c) * u for c, u in zip(changes, units, strict=True)], self.shares)
+
+    @cached_property
+    def _deviations_without(self) -> list[np.ndarray]:
+        """Standard deviations without each block, in those of all rows."""
+        others = [[*self.blocks[:i], *self.blocks[i + 1 :]] for i in range(len(self.blocks))]
+        return [merge_spread(blocks).standard_deviation() / self.deviation for blocks in others]
+
+    def _gradient(self, block: Moments, inputs: np.ndarray, targets: np.ndarray, weights: np.ndarray) -> np.ndarray:
+        """Of half the mean square of the residuals in one block, shape (m, p)."""
+        to_units = self.scale / self.deviation
+        raw = weights * to_units[inputs]
+        gradient = product(raw, block.comoment[np.ix_(inputs, inputs)])
+        gradient -= block.comoment[np.ix_(targets, inputs)] * to_units[targets, None]
+        # The block's means are not those of all rows
+        shift = block.mean - self.mean
+        residual = raw @ shift[inputs] - shift[targets] * to_units[targets]
+        return (gradient / block.count + np.outer(residual, shift[inputs])) * to_units[inputs]

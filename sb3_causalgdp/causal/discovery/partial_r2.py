@@ -1,23 +1,24 @@
 import warnings
-from datetime import datetime, timezone
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
 import torch as th
 
-from sb3_causalgdp.causal.basis import BasisExpansion, BasisMoments
-from sb3_causalgdp.causal.degenerate import Degeneracy, find_degeneracy, variance_inflation
+from sb3_causalgdp.causal.basis import BASES, BasisExpansion, BasisMoments
+from sb3_causalgdp.causal.degenerate import Degeneracy, find_limits
 from sb3_causalgdp.causal.graph import CausalGraph
 from sb3_causalgdp.causal.jackknife import jackknife_error
-from sb3_causalgdp.causal.moments import Moments, StreamingMoments
+from sb3_causalgdp.causal.moments import Moments, Spread, StreamingMoments, merge_spread
 from sb3_causalgdp.causal.variables import TransitionVariables
 
-RIDGE = 1e-9
+RIDGE = 1e-6  # of a feature's variance: features of many causes may be almost dependent where the causes are not
 SMALLEST_RESIDUAL = 1e-9  # of the target's variance: what float32 rounding and the ridge leave of an exact function
 SMALLEST_DEVIATION = 1e-9  # in units of the standard deviation of all rows: below it, a column does not move in these rows
 FLOOR_SHARE = 1.0 / 30.0  # of the threshold: below it, the noise of the logarithm says nothing
 CONFOUNDED_VIF = 40.0
 THINNING = 8
+CHANGES_AT_ONCE = 2**18  # so that they stay in the processor's cache
 
 
 def edge_probability(partial_r2: np.ndarray, log_error: np.ndarray, threshold: float, spread: float) -> np.ndarray:
@@ -41,24 +42,29 @@ class PartialR2:
     """
     Nonlinear discovery: how much of what the other causes leave does each cause explain?
 
-    The targets are regressed on nonlinear features of all their possible causes: each variable as itself, its square, sine and
-    tanh, and the products of pairs. Leaving out all features that a variable is part of raises the residual by
+    The targets are regressed on features of all their possible causes: each variable as itself, its square, sine and tanh, and
+    the products of pairs. Leaving out all features that a variable is part of raises the residual by
     ``SS_j = b_G' [(S^-1)_GG]^-1 b_G``, with S the correlations of the features and b the coefficients, so one Cholesky
     factorisation answers for all edges. ``SS_j`` relative to the residual without j is the partial R^2, adjusted for the
     number of features.
 
     A mask is the probability ``Phi[ln(partial R^2 / threshold) / sqrt(se^2 + spread^2)]``, with the standard error of the
-    logarithm by block jackknife (Busing, Meijer and van der Leeden, 1999). An effect is the difference of the target, in
-    its standard deviations, when a cause moves from half a standard deviation below to half a one above, the others as they
-    are: its size is the mean of the absolute difference over the newest 256 rows, its sign that of the mean, so an even
-    function has an effect too. R^2 is adjusted for the number of features as well.
+    logarithm by a jackknife that leaves out blocks of rows (Busing, Meijer and van der Leeden, 1999). Each estimate without a
+    block is one Newton step from the solution, which makes the errors those of cluster-robust inference (Cameron and Miller,
+    2015, "A practitioner's guide to cluster-robust inference").
+
+    An effect is the difference of the target, in its standard deviations, when a cause moves from half a standard deviation
+    below to half a one above, the others as they are: its size is the mean of the absolute difference over the newest 256
+    rows, its sign that of the mean, so an even function has an effect too. R^2 is adjusted for the number of features as well.
 
     Linearly dependent variables are tested as a group and share its masks; variables that never move have no edges. Where rows
     are few, the products are left out, then sine and tanh, then the square, so that there are two rows for each feature.
 
     :param threshold: Partial R^2 at which a mask is one half, in (0, 1)
     :param spread: Uncertainty of the mask in ln(partial R^2), beside that of the sample, positive
-    :param products: Whether products of pairs are among the features; None: where states and actions are at most 60
+    :param basis: The features: ``"linear"``, each variable as itself alone; ``"additive"``, with square, sine and tanh;
+        ``"products"``, with the products of pairs, too; ``"auto"``: these where states and actions are at most 60, else
+        ``"additive"``
     :param max_memory: Bytes that the moments may take
     :param on_degenerate: ``share`` lets linearly dependent causes share a mask and gives constant ones none, ``raise`` is an
         error that names both
@@ -68,7 +74,7 @@ class PartialR2:
         self,
         threshold: float = 0.03,
         spread: float = 0.5,
-        products: bool | None = None,
+        basis: str = "auto",
         max_memory: float = 200e6,
         on_degenerate: str = "share",
     ) -> None:
@@ -76,11 +82,13 @@ class PartialR2:
             raise ValueError(f"threshold must be in (0, 1), got {threshold!r}")
         if not 0.0 < spread < np.inf:
             raise ValueError(f"spread must be a positive number, got {spread!r}")
+        if basis not in BASES:
+            raise ValueError(f"basis must be one of {BASES}, got {basis!r}")
         if on_degenerate not in ("share", "raise"):
             raise ValueError(f"on_degenerate must be 'share' or 'raise', got {on_degenerate!r}")
         self.threshold = threshold
         self.spread = spread
-        self.products = products
+        self.basis = basis
         self.max_memory = max_memory
         self.on_degenerate = on_degenerate
         self._said_confounded = False
@@ -94,7 +102,14 @@ class PartialR2:
         :param window: Number of newest rows that are kept; None keeps all
         :return: what this method gathers
         """
-        return BasisMoments(variables, half_life, window, self.products, self.max_memory)
+        return BasisMoments(variables, half_life, window, self.basis, self.max_memory)
+
+    def min_rows(self, variables: TransitionVariables) -> int:
+        """
+        :param variables: Names and order of the variables
+        :return: number of rows, not forgotten, that a graph needs
+        """
+        return 2 * (variables.n_states + variables.n_actions) + 4
 
     def __call__(
         self, statistics: BasisMoments, variables: TransitionVariables, previous: CausalGraph | None = None
@@ -110,18 +125,14 @@ class PartialR2:
             variables, or on linearly dependent or constant causes if ``on_degenerate="raise"``
         """
         self._check(statistics, variables)
-        raw = statistics.raw.correlation()
-        causes = (statistics.inputs_of_dynamics, statistics.inputs_of_reward)
-        of_dynamics, of_reward = (find_degeneracy(raw[np.ix_(inputs, inputs)]) for inputs in causes)
-        constant = tuple(np.array(variables.names)[statistics.raw.constant].tolist())
-        duplicated = _names_of_duplicates(of_dynamics, of_reward, variables)
+        limits = find_limits(statistics.raw.correlation(), variables)
         if self.on_degenerate == "raise":
-            _refuse_degenerate(set(constant) & {*variables.state_names, *variables.action_names}, duplicated)
-        inflation = variance_inflation(raw[np.ix_(causes[0], causes[0])])[variables.n_states :]
-        self._say_confounded(inflation, variables)
+            causes = {*variables.state_names, *variables.action_names}
+            _refuse_degenerate(causes.intersection(limits.constant_variables), limits.duplicated_variables)
+        self._say_confounded(limits.action_vif, variables)
         rows = [
-            self._estimate(statistics.dynamics, _dynamics(statistics, of_dynamics)),
-            self._estimate(statistics.reward, _reward(statistics, of_reward)),
+            self._estimate(_dynamics(statistics, limits.of_dynamics)),
+            self._estimate(_reward(statistics, limits.of_reward)),
         ]
         masks, effects, errors, r_squared = (np.concatenate(parts) for parts in zip(*rows, strict=True))
         return CausalGraph(
@@ -130,35 +141,31 @@ class PartialR2:
             effects=effects,
             standard_errors=errors,
             r_squared=r_squared,
-            action_vif=inflation,
             method="partial_r2",
             n_samples=statistics.dynamics.n_samples,
-            constant_variables=constant,
-            duplicated_variables=duplicated,
-            found_at=datetime.now(timezone.utc).isoformat(timespec="seconds"),
+            **limits.remarks(),
         )
 
-    def _estimate(self, moments: StreamingMoments, regression: "_Regression") -> tuple[np.ndarray, ...]:
-        """Masks, effects, standard errors of the effects, and R^2."""
+    def _estimate(self, regression: "_Regression") -> tuple[np.ndarray, ...]:
+        """Masks, effects and standard errors of the effects, each of shape (m, p), and R^2."""
         whole = regression.whole
-        parts, shares = [], []
-        for i in range(moments.n_filled if moments.n_filled > 1 else 0):
-            rest, share = moments.without_block(i)
-            parts.append(regression.estimate(rest))
+        logs, effects, shares = [], [], []
+        for part, share in regression.parts():
+            logs.append(self._log(part))
+            effects.append(part.effects)
             shares.append(share)
-        log_error = jackknife_error(self._log(whole), [self._log(part) for part in parts], shares)
-        error = jackknife_error(whole.effects, [part.effects for part in parts], shares)
+        log_error = jackknife_error(self._log(whole), logs, shares)
         masks = edge_probability(whole.partial_r2, log_error, self.threshold, self.spread)
-        return masks, whole.effects, error, whole.r_squared
+        return masks.T, whole.effects.T, jackknife_error(whole.effects, effects, shares).T, regression.r_squared()
 
     def _log(self, estimates: "_Estimates") -> np.ndarray:
-        return np.log(np.maximum(estimates.partial_r2, FLOOR_SHARE * self.threshold))
+        return th.from_numpy(estimates.partial_r2).clamp(min=FLOOR_SHARE * self.threshold).log().numpy()
 
     def _check(self, statistics: BasisMoments, variables: TransitionVariables) -> None:
         if not isinstance(statistics, BasisMoments) or statistics.variables != variables:
             raise ValueError(f"statistics must be those that make_statistics makes for {variables.names}, got {statistics!r}")
         statistics.start()
-        needed = 2 * (variables.n_states + variables.n_actions) + 4
+        needed = self.min_rows(variables)
         n_rows = statistics.dynamics.count
         # Weights of a half-life do not add up to an integer
         if n_rows < needed - 0.5:
@@ -179,20 +186,6 @@ class PartialR2:
         )
 
 
-def _names_of_duplicates(
-    of_dynamics: Degeneracy, of_reward: Degeneracy, variables: TransitionVariables
-) -> tuple[tuple[str, ...], ...]:
-    """Groups among (s, a), and those that are among (s', a) alone."""
-    before = (*variables.state_names, *variables.action_names)
-    after = (*variables.next_state_names, *variables.action_names)
-    known = {tuple(sorted(group)) for group in of_dynamics.groups}
-    groups = [*of_dynamics.names_of_groups(before)]
-    for group, names in zip(of_reward.groups, of_reward.names_of_groups(after), strict=True):
-        if tuple(sorted(group)) not in known:
-            groups.append(names)
-    return tuple(groups)
-
-
 def _refuse_degenerate(constant: set[str], duplicated: tuple[tuple[str, ...], ...]) -> None:
     if constant or duplicated:
         raise ValueError(
@@ -201,23 +194,22 @@ def _refuse_degenerate(constant: set[str], duplicated: tuple[tuple[str, ...], ..
 
 
 class _Estimates(NamedTuple):
-    """Of m targets and their p possible causes: partial R^2 (m, p), effects (m, p), R^2 (m,)."""
+    """Of p possible causes and their m targets: partial R^2 and effects, each of shape (p, m)."""
 
     partial_r2: np.ndarray
     effects: np.ndarray
-    r_squared: np.ndarray
 
 
-class _Group(NamedTuple):
+class _Tests(NamedTuple):
     """
-    Causes that are tested alike, each with g features, or together.
+    Leave-outs of as many features each: of a cause alone, or of linearly dependent ones together.
 
-    :param causes: Indices of q causes; of one group of duplicates, whose features are one row below
-    :param features: Indices of their features, shape (q, g), or (1, g)
-    :param spread: Covariance of these features given all others, ``[(S^-1)_GG]^-1``, shape (q, g, g), or (1, g, g)
+    :param causes: Index of one of the causes that each is about, shape (q,)
+    :param features: Indices of the features that are left out, shape (q, g)
+    :param spread: Covariance of these features given all others, ``[(S^-1)_GG]^-1``, shape (q, g, g)
     """
 
-    causes: list[int]
+    causes: np.ndarray
     features: th.Tensor
     spread: th.Tensor
 
@@ -228,156 +220,246 @@ class _Fit(NamedTuple):
 
     :param coefficients: In units of the features' and the targets' standard deviations in all rows, shape (F, m)
     :param deviation: Standard deviations of the features in these rows, in the same units, shape (F,)
-    :param variance: Of the targets in these rows, in the same units, shape (m,)
+    :param variance: Of the targets in these rows, in the same units, 1 for those that do not move; shape (m,)
     :param residual: Variance that the features leave, shape (m,)
-    :param freedom: Rows less features less 1, at least 1
     """
 
     coefficients: th.Tensor
     deviation: np.ndarray
     variance: np.ndarray
     residual: np.ndarray
-    freedom: float
 
 
 def _dynamics(statistics: BasisMoments, degeneracy: Degeneracy) -> "_Regression":
     assert statistics.expansions is not None
     targets = np.arange(statistics.variables.n_variables)[statistics.variables.next_state]
-    moments, inputs = statistics.dynamics.total(), statistics.inputs_of_dynamics
-    return _Regression(statistics, moments, statistics.expansions[0], inputs, targets, degeneracy)
+    inputs = statistics.inputs_of_dynamics
+    return _Regression(statistics, statistics.dynamics, statistics.expansions[0], inputs, targets, degeneracy)
 
 
 def _reward(statistics: BasisMoments, degeneracy: Degeneracy) -> "_Regression":
     assert statistics.expansions is not None
-    targets = np.array([statistics.variables.reward])
-    moments, inputs = statistics.reward.total(), statistics.inputs_of_reward
-    return _Regression(statistics, moments, statistics.expansions[1], inputs, targets, degeneracy)
+    targets, inputs = np.array([statistics.variables.reward]), statistics.inputs_of_reward
+    return _Regression(statistics, statistics.reward, statistics.expansions[1], inputs, targets, degeneracy)
 
 
 class _Regression:
     """
-    Regresses some targets on the features of their possible causes: on all rows, and then on parts of them.
+    Regresses some targets on the features of their possible causes, on all rows, by one factorisation.
 
-    The covariance of a cause's features given all others is that of all rows: its error is far smaller than that of the
-    coefficients, and the parts need no inverse.
+    What a part of the rows says is one Newton step away: the second moments of the features there are taken to be those of
+    all rows, but for the features' own variances.
 
     :param statistics: Where the scales and the newest rows come from
-    :param moments: Of the features and, behind them, the targets, of all rows
+    :param moments: Of the features and, behind them, the targets
     :param expansion: The features
-    :param inputs: Columns of the possible causes
-    :param targets: Columns of the targets
+    :param inputs: Columns of the p possible causes
+    :param targets: Columns of the m targets
     :param degeneracy: What cannot be told apart among the inputs
     """
 
     def __init__(
         self,
         statistics: BasisMoments,
-        moments: Moments,
+        moments: StreamingMoments,
         expansion: BasisExpansion,
         inputs: np.ndarray,
         targets: np.ndarray,
         degeneracy: Degeneracy,
     ) -> None:
-        self.shape = len(targets), len(inputs)
+        self.shape = len(inputs), len(targets)
         self.n_features = expansion.n_features
         self.degeneracy = degeneracy
-        used = _affordable_features(expansion, degeneracy.kept, moments.count)
+        self.blocks = moments.blocks
+        total = moments.total()
+        self.total: Spread = total
+        used = _affordable_features(expansion, degeneracy.kept, total.count)
         self.used = np.isin(np.arange(self.n_features), used)
-        feature_deviation = np.sqrt(np.diagonal(moments.comoment)[: self.n_features] / moments.count)
+        self.freedom = max(total.count - len(used) - 1.0, 1.0)
+        feature_deviation = total.standard_deviation()[: self.n_features]
         # A feature that is not used, or does not move, has nothing in common with any other
         moves = self.used & (feature_deviation > SMALLEST_DEVIATION)
         self.inverse_scale = moves / np.where(moves, feature_deviation, 1.0)
-
-        deviation = statistics.raw.standard_deviation()
-        self.target_moves = ~statistics.raw.constant[targets]
+        spread = statistics.raw.spread()
+        deviation = spread.standard_deviation()
+        self.target_moves = ~spread.constant[targets]
         self.target_scale = np.where(self.target_moves, deviation[targets], 1.0)
-        self.features_of = {int(i): expansion.features_of(int(i)) for i in degeneracy.kept}
-        standardised = expansion.standardise(statistics.recent[:, inputs])
-        if not expansion.products:
-            # What changes with a cause is then a function of it alone: one of its ordered values can stand for its neighbours
-            standardised = np.sort(standardised, axis=0)[THINNING // 2 - 1 :: THINNING]
-        half_steps = 0.5 * deviation[inputs] / expansion.scale
-        self.differences = {i: expansion.difference(standardised, i, half_steps[i]) for i in self.features_of}
 
-        factor = self._factor(moments)
-        fit = self._fit(moments, factor)
-        # In place: another matrix of this size would be felt
-        self.groups = self._groups(th.cholesky_inverse(factor, out=factor))
-        self.whole = self._estimates(fit)
+        factor = self._factor(total)
+        self.fit = self._fit(total, factor)
+        inverse = th.cholesky_inverse(factor, out=factor)
+        features_of_kept = expansion.features_of(degeneracy.kept)
+        self.tests = self._tests(features_of_kept, inverse)
+        # Rounding changes a step by less than 1e-7 sqrt(F) of its error for each standard deviation
+        self.inverse = inverse.float()
+        self.features_of_kept = th.from_numpy(features_of_kept)
+        self.slopes, self.mean_slopes = self._slopes(statistics, expansion, inputs, 0.5 * deviation[inputs] / expansion.scale)
+        self.whole = self._estimates(self.fit)
 
-    def estimate(self, moments: Moments) -> _Estimates:
+    def r_squared(self) -> np.ndarray:
         """
-        :param moments: Of the features and, behind them, the targets, of some of the rows
-        :return: what they say
+        :return: share of the targets' variance that the features explain, adjusted for their number, shape (m,)
         """
-        return self._estimates(self._fit(moments, self._factor(moments)))
+        total_freedom = self.freedom + int(self.used.sum())
+        return np.maximum(1.0 - (self.fit.residual / self.freedom) / (self.fit.variance / total_freedom), 0.0)
 
-    def _factor(self, moments: Moments) -> th.Tensor:
-        """Cholesky factor of the features' second moments S, in units of their standard deviations, shape (F, F)."""
-        gram = moments.comoment[: self.n_features, : self.n_features] * (self.inverse_scale / moments.count)
+    def parts(self) -> Iterator[tuple[_Estimates, float]]:
+        """
+        :return: for each block, what all other rows say, and the share of the weight that it has; none with fewer than two
+        """
+        if len(self.blocks) < 2:
+            return
+        scores, squares = zip(*(self._scores(block) for block in self.blocks), strict=True)
+        for i, block in enumerate(self.blocks):
+            others = [j for j in range(len(self.blocks)) if j != i]
+            rest = merge_spread([self.blocks[j] for j in others])
+            residual = np.sum([squares[j] for j in others], axis=0) / rest.count
+            yield self._estimates(self._step(scores[i], residual, rest)), block.count / self.total.count
+
+    def _factor(self, total: Moments) -> th.Tensor:
+        """Cholesky factor of the features' second moments S, in units of their standard deviations; takes the place of
+        ``total.comoment``."""
+        gram = total.comoment
+        gram *= self.inverse_scale / total.count
         gram *= self.inverse_scale[:, None]
         diagonal = np.einsum("ii->i", gram)
         diagonal[self.inverse_scale == 0.0] = 1.0
         diagonal += RIDGE
-        return th.linalg.cholesky(th.as_tensor(gram), out=th.as_tensor(gram))
+        # In place, and by columns: LAPACK wants these, and another matrix of this size would be felt
+        by_columns = th.from_numpy(gram).T
+        return th.linalg.cholesky(by_columns, out=by_columns)
 
-    def _groups(self, inverse: th.Tensor) -> list[_Group]:
-        in_group = {member for group in self.degeneracy.groups for member in group}
-        alone = [i for i in self.features_of if i not in in_group]
-        causes_and_features = [(alone, np.stack([self.features_of[i] for i in alone]))] if alone else []
-        for group in self.degeneracy.groups:
-            members = [self.features_of[i] for i in group if i in self.features_of]
-            causes_and_features.append((list(group), np.unique(np.concatenate(members))[None]))
-        groups = []
-        for causes, indices in causes_and_features:
-            features = th.as_tensor(indices)
-            spread = th.linalg.inv(inverse[features[:, :, None], features[:, None, :]])
-            groups.append(_Group(causes, features, spread))
-        return groups
-
-    def _fit(self, moments: Moments, factor: th.Tensor) -> _Fit:
-        n_features, n_used = self.n_features, int(self.used.sum())
-        cross = moments.comoment[:n_features, n_features:] * self.inverse_scale[:, None] / (moments.count * self.target_scale)
-        variance = np.diagonal(moments.comoment) / moments.count
-        deviation, variance = np.sqrt(variance[:n_features]) * self.inverse_scale, variance[n_features:] / self.target_scale**2
-        moves = self.target_moves & (variance > SMALLEST_DEVIATION**2)
-        variance = np.where(moves, variance, 1.0)
+    def _fit(self, total: Moments, factor: th.Tensor) -> _Fit:
+        cross = total.cross * self.inverse_scale[:, None] / (total.count * self.target_scale)
+        deviation, variance, moves = self._units(total)
         cross[:, ~moves] = 0.0
-        coefficients = th.cholesky_solve(th.as_tensor(cross), factor)
-        explained = (coefficients.numpy() * cross).sum(axis=0)
-        residual = np.maximum(variance - explained, SMALLEST_RESIDUAL * variance)
-        return _Fit(coefficients, deviation, variance, residual, max(moments.count - n_used - 1.0, 1.0))
+        coefficients = th.cholesky_solve(th.from_numpy(cross), factor)
+        # The ridge takes part of what is explained: b' (S + ridge) b = b' c
+        explained = np.einsum("ij,ij->j", coefficients.numpy(), cross + RIDGE * coefficients.numpy())
+        return _Fit(coefficients, deviation, variance, _residual(variance - explained, variance))
+
+    def _units(self, spread: Spread) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Deviations of the features and variances of the targets, in units of all rows; and which targets move."""
+        variance = spread.squares / spread.count
+        deviation = np.sqrt(variance[: self.n_features]) * self.inverse_scale
+        variance = variance[self.n_features :] / self.target_scale**2
+        moves = self.target_moves & (variance > SMALLEST_DEVIATION**2)
+        return deviation, np.where(moves, variance, 1.0), moves
+
+    def _tests(self, features_of_kept: np.ndarray, inverse: th.Tensor) -> list[_Tests]:
+        in_group = {member for group in self.degeneracy.groups for member in group}
+        left_out: dict[int, list[tuple[int, np.ndarray]]] = {}
+        for cause, features in zip(self.degeneracy.kept.tolist(), features_of_kept, strict=True):
+            if cause not in in_group:
+                left_out.setdefault(len(features), []).append((cause, features))
+        for group in self.degeneracy.groups:
+            features = np.unique(features_of_kept[np.isin(self.degeneracy.kept, group)])
+            left_out.setdefault(len(features), []).append((group[0], features))
+        tests = []
+        for together in left_out.values():
+            causes, indices = (np.array(part) for part in zip(*together, strict=True))
+            features = th.from_numpy(indices)
+            spread = th.linalg.inv(inverse[features[:, :, None], features[:, None, :]])
+            tests.append(_Tests(causes, features, spread))
+        return tests
+
+    def _slopes(
+        self, statistics: BasisMoments, expansion: BasisExpansion, inputs: np.ndarray, half_steps: np.ndarray
+    ) -> tuple[th.Tensor, th.Tensor]:
+        """
+        How the mean absolute change of the targets, shape (q, g, m), and the mean change, shape (q, g, 1), grow with the
+        coefficients of the q kept causes' g features.
+        """
+        standardised = expansion.standardise(statistics.recent[:, inputs])
+        if expansion.basis == "linear":
+            standardised = standardised[:1]
+        elif not expansion.products:
+            # What changes with a cause is then a function of it alone: one of its ordered values can stand for its neighbours
+            standardised = np.sort(standardised, axis=0)[THINNING // 2 - 1 :: THINNING]
+        kept = self.degeneracy.kept
+        raw = self.fit.coefficients * th.from_numpy(self.inverse_scale)[:, None]
+        slopes = th.empty(*self.features_of_kept.shape, self.shape[1], dtype=raw.dtype)
+        differences = th.from_numpy(np.ascontiguousarray(expansion.differences(standardised, kept, half_steps)))
+        n_causes = max(1, CHANGES_AT_ONCE // (len(standardised) * self.shape[1]))
+        for first in range(0, len(kept), n_causes):
+            chunk = slice(first, first + n_causes)
+            difference, of_cause = differences[chunk], raw[self.features_of_kept[chunk]]
+            slopes[chunk] = difference.transpose(1, 2) @ th.sign(difference @ of_cause) / len(standardised)
+        units = th.from_numpy(self.inverse_scale)[self.features_of_kept][:, :, None]
+        return slopes * units, differences.mean(dim=1)[:, :, None] * units
+
+    def _scores(self, block: Moments) -> tuple[th.Tensor, np.ndarray]:
+        """
+        Of the rows of one block, in units of all rows: sums of the products of features and residuals, the gradient of least
+        squares, shape (F, m); and sums of the squared residuals, shape (m,).
+        """
+        raw = self.fit.coefficients * th.from_numpy(self.inverse_scale)[:, None]
+        cross = th.from_numpy(block.cross / self.target_scale)
+        scores = th.addmm(cross, th.from_numpy(block.comoment), raw, alpha=-1.0)
+        squares = block.squares[self.n_features :] / self.target_scale**2
+        squares = squares - (raw * (cross + scores)).sum(dim=0).numpy()
+        # The block's means are not those of all rows
+        shift = block.mean - self.total.mean
+        residual = shift[self.n_features :] / self.target_scale - shift[: self.n_features] @ raw.numpy()
+        scores += th.outer(th.from_numpy(block.count * shift[: self.n_features]), th.from_numpy(residual))
+        scores *= th.from_numpy(self.inverse_scale)[:, None]
+        return scores, np.maximum(squares + block.count * residual**2, 0.0)
+
+    def _step(self, scores: th.Tensor, residual: np.ndarray, rest: Spread) -> _Fit:
+        """
+        The fit without some rows.
+
+        :param scores: Of the rows that are left out, shape (F, m)
+        :param residual: Mean square of the residuals of all others, shape (m,)
+        :param rest: Of all others
+        """
+        deviation, variance, moves = self._units(rest)
+        still = deviation <= SMALLEST_DEVIATION
+        inverse = th.from_numpy(~still / np.where(still, 1.0, deviation))[:, None]
+        # Residuals are smaller than the errors, by the features that were fitted to them
+        size = np.sqrt(self.total.count / self.freedom) / rest.count
+        step = (self.inverse @ (inverse * scores).float()).double()
+        coefficients = th.addcmul(self.fit.coefficients, inverse, step, value=-size)
+        coefficients[still] = 0.0
+        coefficients[:, ~moves] = 0.0
+        return _Fit(coefficients, deviation, variance, _residual(residual, variance))
 
     def _estimates(self, fit: _Fit) -> _Estimates:
-        total_freedom = fit.freedom + int(self.used.sum())
-        r_squared = np.maximum(1.0 - (fit.residual / fit.freedom) / (fit.variance / total_freedom), 0.0)
-        return _Estimates(self._partial_r2(fit), self._effects(fit), r_squared)
+        return _Estimates(self._partial_r2(fit), self._effects(fit))
 
     def _partial_r2(self, fit: _Fit) -> np.ndarray:
         partial = np.zeros(self.shape)
-        for causes, features, spread in self.groups:
-            of_group = fit.coefficients[features]
-            explained = (of_group * (spread @ of_group)).sum(dim=1).numpy()
+        for causes, features, spread in self.tests:
+            left_out = fit.coefficients[features]
+            # Products of single numbers in a batch are slow
+            explained = left_out * (spread @ left_out if features.shape[1] > 1 else spread * left_out)
             # Variances instead of sums of squares, as in the adjusted R^2, so that a null edge has 0 on average
             n_features = self.used[features.numpy()].sum(axis=1)[:, None]
-            ratio = (fit.residual / fit.freedom) / ((fit.residual + explained) / (fit.freedom + n_features))
-            partial[:, causes] = np.maximum(1.0 - ratio, 0.0).T
+            without = _summed(explained).numpy() + fit.residual
+            partial[causes] = np.maximum(1.0 - fit.residual * (1.0 + n_features / self.freedom) / without, 0.0)
+        for group in self.degeneracy.groups:
+            partial[list(group)] = partial[group[0]]
         return partial
 
     def _effects(self, fit: _Fit) -> np.ndarray:
         effects = np.zeros(self.shape)
-        coefficients = fit.coefficients.numpy() * self.inverse_scale[:, None]
-        for i, difference in self.differences.items():
-            of_cause = coefficients[self.features_of[i]]
-            change = difference @ of_cause
-            average = np.full(len(change), 1.0 / len(change))
-            # A product with the weights is several times faster than mean(axis=0)
-            effects[:, i] = np.copysign(average @ np.abs(change, out=change), (average @ difference) @ of_cause)
+        of_causes = fit.coefficients[self.features_of_kept]
+        size, mean = _summed(self.slopes * of_causes), _summed(self.mean_slopes * of_causes)
+        effects[self.degeneracy.kept] = th.copysign(size, mean).numpy()
         # In standard deviations of these rows: the errors of the scales and of the coefficients partly cancel
-        effects *= fit.deviation[: self.shape[1]] / np.sqrt(fit.variance)[:, None]
+        effects *= np.outer(fit.deviation[: self.shape[0]], 1.0 / np.sqrt(fit.variance))
         for variable, (stand_in, sign) in self.degeneracy.stand_in.items():
-            effects[:, variable] = sign * effects[:, stand_in]
+            effects[variable] = sign * effects[stand_in]
         return effects
+
+
+def _summed(values: th.Tensor) -> th.Tensor:
+    """Over the second dimension."""
+    return values[:, 0] if values.shape[1] == 1 else values.sum(dim=1)
+
+
+def _residual(residual: np.ndarray, variance: np.ndarray) -> np.ndarray:
+    return np.maximum(residual, SMALLEST_RESIDUAL * variance)
 
 
 def _affordable_features(expansion: BasisExpansion, inputs: np.ndarray, n_rows: float) -> np.ndarray:

@@ -1,4 +1,5 @@
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -52,6 +53,15 @@ class Perturbed:
             return statistics
         return NoisyStatistics(statistics, variables, self.noise, self.seed)
 
+    def min_rows(self, variables: TransitionVariables) -> int:
+        """
+        :param variables: Names and order of the variables
+        :return: number of rows that the wrapped method needs for a graph
+        """
+        from sb3_causalgdp.causal.discovery import min_rows
+
+        return min_rows(self.method, variables)
+
     def __call__(
         self,
         statistics: "StreamingMoments | NoisyStatistics",
@@ -84,30 +94,23 @@ def _causes(variables: TransitionVariables) -> np.ndarray:
 
 class NoisyMoments(StreamingMoments):
     """
-    A view of moments as they would be with independent noise on some columns.
+    Moments as they would be with independent noise on some columns.
 
-    :param moments: Moments without noise; shared, not copied
+    :param moments: Moments without noise, without targets; never changed
     :param noise: Standard deviation of the noise in the columns' standard deviations
     :param noisy: Which columns have noise, boolean, shape (p,)
     """
 
     def __init__(self, moments: StreamingMoments, noise: float, noisy: np.ndarray) -> None:
         self.__dict__.update(moments.__dict__)
-        self._clean = moments
-        self._added = np.diag(noise**2 * noisy * np.diagonal(moments.covariance())) if moments.n_samples else np.zeros(1)
+        if moments.n_filled > 0:
+            variance = noise**2 * noisy * moments.standard_deviation() ** 2
+            self._blocks = [_with_noise(block, variance) for block in moments.blocks]
 
-    def _with_noise(self, moments: Moments) -> Moments:
-        return Moments(moments.count, moments.mean, moments.comoment + moments.count * self._added)
 
-    def total(self) -> Moments:
-        return self._with_noise(self._clean.total())
-
-    def without_block(self, index: int) -> tuple[Moments, float]:
-        rest, share = self._clean.without_block(index)
-        return self._with_noise(rest), share
-
-    def leave_one_out(self) -> list[tuple[Moments, float]]:
-        return [(self._with_noise(rest), share) for rest, share in self._clean.leave_one_out()]
+def _with_noise(moments: Moments, variance: np.ndarray) -> Moments:
+    added = moments.count * variance
+    return replace(moments, squares=moments.squares + added, comoment=moments.comoment + np.diag(added))
 
 
 class NoisyStatistics:

@@ -1,11 +1,10 @@
 from collections.abc import Sequence
-from datetime import datetime, timezone
 from typing import NamedTuple
 
 import numpy as np
 import torch as th
 
-from sb3_causalgdp.causal.degenerate import find_degeneracy, variance_inflation
+from sb3_causalgdp.causal.degenerate import find_limits
 from sb3_causalgdp.causal.discovery.partial_r2 import edge_probability
 from sb3_causalgdp.causal.graph import CausalGraph
 from sb3_causalgdp.causal.recent_rows import RecentRows, checked_rows
@@ -110,6 +109,13 @@ class WorldModelEffects:
         """
         return RecentRows(variables, half_life, window, default_window=self.window)
 
+    def min_rows(self, variables: TransitionVariables) -> int:
+        """
+        :param variables: Names and order of the variables
+        :return: number of rows that a graph needs
+        """
+        return variables.n_states + variables.n_actions + 10
+
     def __call__(
         self, statistics: RecentRows, variables: TransitionVariables, previous: CausalGraph | None = None
     ) -> CausalGraph:
@@ -122,7 +128,7 @@ class WorldModelEffects:
         :return: the graph; constant variables have no edges
         :raises ValueError: on fewer than n + d + 10 rows, or when the arguments are not about the same variables
         """
-        rows = checked_rows(statistics, variables, "world_model", self._needed(variables))
+        rows = checked_rows(statistics, variables, "world_model", self.min_rows(variables))
         generator = th.Generator().manual_seed(self.seed + self._refreshes)
         order = th.randperm(len(rows), generator=generator)
         values = th.as_tensor(rows[order.numpy()], dtype=th.float32)
@@ -157,19 +163,14 @@ class WorldModelEffects:
         if statistics is None:
             statistics = RecentRows(variables)
             statistics.update(rows)
-            checked_rows(statistics, variables, "world_model", self._needed(variables))
-        moments = statistics.moments
+            checked_rows(statistics, variables, "world_model", self.min_rows(variables))
+        moments = statistics.moments.total()
         deviation = np.where(moments.constant, 0.0, moments.standard_deviation())
         differences = _differences(world_model, np.asarray(rows)[:MOST_TEST_ROWS], variables, deviation)
-        n_states, n_inputs = variables.n_states, variables.n_states + variables.n_actions
-        inputs = np.arange(n_inputs)
-        after = np.concatenate([np.arange(variables.n_variables)[variables.next_state], inputs[variables.action]])
-        correlation = moments.correlation()
-        now, then = correlation[np.ix_(inputs, inputs)], correlation[np.ix_(after, after)]
-        groups = find_degeneracy(now)
+        n_states = variables.n_states
+        limits = find_limits(moments.correlation(), variables)
         probability = self._probability(differences)
-        masks = [groups.share(probability[:n_states]), find_degeneracy(then).share(probability[n_states:])]
-        names = np.array(variables.names)
+        masks = [limits.of_dynamics.share(probability[:n_states]), limits.of_reward.share(probability[n_states:])]
         return CausalGraph(
             variables,
             np.concatenate(masks),
@@ -177,14 +178,8 @@ class WorldModelEffects:
             method="world_model",
             n_samples=statistics.n_samples,
             r_squared=np.clip(1.0 - differences.residual, 0.0, 1.0),
-            action_vif=variance_inflation(now)[n_states:],
-            constant_variables=tuple(names[moments.constant].tolist()),
-            duplicated_variables=groups.names_of_groups((*variables.state_names, *variables.action_names)),
-            found_at=datetime.now(timezone.utc).isoformat(timespec="seconds"),
+            **limits.remarks(),
         )
-
-    def _needed(self, variables: TransitionVariables) -> int:
-        return variables.n_states + variables.n_actions + 10
 
     def _probability(self, differences: _Differences) -> np.ndarray:
         squares = differences.absolute**2

@@ -1,0 +1,44 @@
+import numpy as np
+import pytest
+
+from sb3_causalgdp.causal import CausalGraph, TransitionVariables, discover, make_discovery, min_rows
+
+VARIABLES = TransitionVariables(("x", "y", "z"), ("push", "pull"))
+METHODS = {
+    "partial_r2": ({}, 14),
+    "notears": ({}, 7),
+    "world_model": ({"first_gradient_steps": 2}, 15),
+    "direct_lingam": ({}, 18),
+    "perturbed": ({"method": "partial_r2", "noise": 0.0}, 14),
+}
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_a_method_says_how_many_rows_it_needs(name):
+    kwargs, n_rows = METHODS[name]
+    if name == "direct_lingam":
+        pytest.importorskip("lingam")
+    assert min_rows(make_discovery(name, **kwargs), VARIABLES) == n_rows
+    rows = np.random.default_rng(0).standard_normal((n_rows, VARIABLES.n_variables))
+    assert discover(name, rows, VARIABLES, **kwargs).n_samples == n_rows
+    with pytest.raises(ValueError, match=rf"at least {n_rows} rows .*got {n_rows - 1}|at least {n_rows} rows, got"):
+        discover(name, rows[:-1], VARIABLES, **kwargs)
+
+
+def test_a_callable_that_does_not_say_needs_one_row():
+    assert min_rows(lambda statistics, variables, previous=None: CausalGraph.fully_connected(variables), VARIABLES) == 1
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_a_graph_says_when_it_was_found_and_what_the_data_cannot_say(name):
+    kwargs, _ = METHODS[name]
+    if name == "direct_lingam":
+        pytest.importorskip("lingam")
+    rows = np.random.default_rng(0).standard_normal((200, VARIABLES.n_variables))
+    rows[:, 1] = -2.0 * rows[:, 0]
+    rows[:, 4] = 1.0
+    graph = discover(name, rows, VARIABLES, **kwargs)
+    assert graph.found_at.endswith("+00:00") and graph.constant_variables == ("pull",)
+    assert graph.duplicated_variables == (("x", "y"),)
+    np.testing.assert_array_equal(graph.masks[:, 0][:3], graph.masks[:, 1][:3])
+    assert graph.action_vif.shape == (2,) and graph.action_vif[1] == 1.0

@@ -1,0 +1,200 @@
+"""What the documentation promises to list: public names, arguments, logged keys, errors, figures."""
+
+import ast
+import inspect
+import re
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium import spaces
+from stable_baselines3 import HerReplayBuffer
+from stable_baselines3.common.envs import BitFlippingEnv, FakeImageEnv
+from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+
+import sb3_causalgdp
+from sb3_causalgdp import CausalGDP, CausalWorldModelCallback
+from sb3_causalgdp.causal import CausalGraph, TransitionVariables
+from sb3_causalgdp.policies import CausalGDPPolicy
+
+PACKAGE = Path(sb3_causalgdp.__file__).parent
+DOCS = Path(__file__).parents[2] / "docs"
+KWARGS = {"learning_starts": 10, "batch_size": 8, "train_freq": 16, "causal_refresh_freq": 48, "buffer_size": 1_000, "seed": 0}
+SMALL = {**KWARGS, "policy_kwargs": {"net_arch": [16], "world_model_net_arch": [16]}}
+
+
+def read(page):
+    return (DOCS / page).read_text(encoding="utf-8")
+
+
+# Names ------------------------------------------------------------------------------------------------------------------
+
+
+def module_of(file):
+    parts = file.relative_to(PACKAGE.parent).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+def public_names(file):
+    """``__all__``, or without one what is defined there and has no underscore."""
+    tree = ast.parse(file.read_text(encoding="utf-8"))
+    for node in tree.body:
+        if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name) and node.targets[0].id == "__all__":
+            return ast.literal_eval(node.value)
+    defined = (node.name for node in tree.body if isinstance(node, ast.ClassDef | ast.FunctionDef))
+    return [name for name in defined if not name.startswith("_")]
+
+
+PUBLIC_MODULES = [
+    *(file for file in sorted(PACKAGE.rglob("__init__.py")) if file.read_text(encoding="utf-8").strip()),
+    *(PACKAGE / f"{name}.py" for name in ("callbacks", "diagnostics", "losses", "pictures", "policies", "structural")),
+]
+
+
+def documented_names():
+    """Full names of what the API reference documents, and modules that it documents whole."""
+    names, modules = set(), set()
+    for page in (DOCS / "modules").glob("*.md"):
+        text = page.read_text(encoding="utf-8")
+        names.update(re.findall(r"^\.\. (?:auto\w+|py:\w+):: (\S+)$", text, re.MULTILINE))
+        modules.update(re.findall(r"^\.\. automodule:: (\S+)\n    :members:\n", text + "\n", re.MULTILINE))
+    return names, modules
+
+
+@pytest.mark.parametrize("file", PUBLIC_MODULES, ids=module_of)
+def test_every_public_name_is_in_the_api_reference(file):
+    names, modules = documented_names()
+    module = module_of(file)
+    last_parts = {name.rpartition(".")[2] for name in names}
+    missing = [name for name in public_names(file) if module not in modules and name not in last_parts]
+    assert not [name for name in missing if name != "__version__"], f"docs/modules lacks these of {module}: {missing}"
+
+
+# Arguments --------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("owner", [CausalGDP, CausalGDPPolicy])
+def test_every_argument_is_in_the_overview_and_in_the_docstring(owner):
+    parameters = [name for name in inspect.signature(owner.__init__).parameters if name != "self"]
+    listed = set(re.findall(r"`(\w+)`", read("guide/arguments.md")))
+    assert not set(parameters) - listed, "docs/guide/arguments.md lacks these"
+    described = re.findall(r":param (\w+):", inspect.getdoc(owner) or "")
+    assert described == parameters
+
+
+def test_the_overview_lists_no_argument_that_is_gone():
+    rows = re.findall(r"^\| (`.*?) \|", read("guide/arguments.md"), re.MULTILINE)
+    known = {name for owner in (CausalGDP, CausalGDPPolicy) for name in inspect.signature(owner.__init__).parameters}
+    assert not set(re.findall(r"`(\w+)`", " ".join(rows))) - known
+
+
+# Logged keys ------------------------------------------------------------------------------------------------------------
+
+
+def test_every_logged_key_has_a_row_and_every_row_a_key(monkeypatch):
+    recorded = set()
+    record = Logger.record
+    monkeypatch.setattr(Logger, "record", lambda self, key, *args, **kw: recorded.add(key) or record(self, key, *args, **kw))
+    model = CausalGDP("MlpPolicy", "Pendulum-v1", **SMALL)
+    model.learn(64, callback=CausalWorldModelCallback(min_transitions=30))
+    model.pretrain(1, log_interval=1)
+    rows = set(re.findall(r"^\| `(\w+/\w+)` \|", read("guide/callbacks.md"), re.MULTILINE))
+    ours = {key for key in recorded if not key.startswith("rollout/") and key not in sb3_keys()}
+    assert ours - rows == set(), "docs/guide/callbacks.md lacks these"
+    assert rows - recorded == {"eval/normalized_score"}  # by a callback of its own, tests/offline/test_scores.py
+
+
+def sb3_keys():
+    return {f"time/{name}" for name in ("episodes", "fps", "time_elapsed", "total_timesteps")} | {"train/learning_rate"}
+
+
+# Errors that the page on SB3 quotes -------------------------------------------------------------------------------------
+
+
+class NanEnv(gym.Env):
+    observation_space = spaces.Box(-1.0, 1.0, (2,))
+    action_space = spaces.Box(-1.0, 1.0, (1,))
+
+    def reset(self, *, seed=None, options=None):
+        return np.zeros(2, dtype=np.float32), {}
+
+    def step(self, action):
+        return np.full(2, np.nan, dtype=np.float32), 0.0, False, False, {}
+
+
+class UnboundedEnv(NanEnv):
+    action_space = spaces.Box(-np.inf, np.inf, (1,))
+
+
+def make(env="Pendulum-v1", policy="MlpPolicy", **kwargs):
+    return CausalGDP(policy, env, **{**SMALL, **kwargs})
+
+
+def preload_twice_scaled():
+    make(VecNormalize(DummyVecEnv([lambda: gym.make("Pendulum-v1")])), offline_dataset="data.npz", reward_transform="antmaze")
+
+
+def preload_with_hindsight():
+    env = BitFlippingEnv(continuous=True)
+    kwargs = {"replay_buffer_class": HerReplayBuffer, "offline_dataset": "data.npz", "reward_transform": "antmaze"}
+    make(env, "MultiInputPolicy", **kwargs)
+
+
+def react_to_images():
+    env = FakeImageEnv(screen_height=36, screen_width=36, n_channels=1, discrete=False, channel_first=True)
+    model = CausalGDP("CnnPolicy", env, **KWARGS, policy_kwargs={"features_extractor_kwargs": {"features_dim": 4}})
+    model.learn(32)
+    observations = np.stack([env.observation_space.sample() for _ in range(2)])
+    model.counterfactual((observations, np.zeros((1, *env.action_space.shape)), [0.0]), {"action[0]": 0.0}, follow_policy=True)
+
+
+def write_a_foreign_graph():
+    make().set_causal_graph(CausalGraph.fully_connected(TransitionVariables(("x",), ("u",))))
+
+
+ERRORS = {
+    "The algorithm only supports": lambda: make("CartPole-v1"),
+    "Continuous action space must have a finite lower and upper bound": lambda: make(UnboundedEnv()),
+    "You must use `MultiInputPolicy` when working with dict observation space": lambda: make(BitFlippingEnv(continuous=True)),
+    "unexpected keyword argument 'use_sde'": lambda: make(use_sde=True),
+    "The environment returned a NaN or infinite observation at step": lambda: make(NanEnv()).learn(10),
+    "Unknown guidance mode 'plain': it must be one of": lambda: make(guidance="plain"),
+    "unknown discovery method": lambda: make(causal_discovery="nothing"),
+    "VecNormalize scales the rewards already: pass norm_reward=False to it": preload_twice_scaled,
+    "HerReplayBuffer computes rewards anew: reward_transform must be 'none' with it": preload_with_hindsight,
+    "There is nothing to train on: call preload(source) or load_replay_buffer(path) first": lambda: make().pretrain(1),
+    "The world model has not been trained": lambda: make().intervene(np.zeros(3), np.zeros(1), {}),
+    "The policy cannot act in predicted states": react_to_images,
+    "At most one CausalWorldModelCallback can be passed, got 2": lambda: make().learn(
+        10, callback=[CausalWorldModelCallback(), CausalWorldModelCallback()]
+    ),
+    "The graph is about": write_a_foreign_graph,
+}
+
+
+@pytest.mark.parametrize("message", ERRORS)
+def test_the_errors_that_are_quoted_are_those_that_are_raised(message):
+    (row,) = (line for line in read("guide/sb3.md").splitlines() if message in line)
+    with pytest.raises(Exception, match=re.escape(message)) as error:
+        ERRORS[message]()
+    assert f"`{error.type.__name__}`: " in row
+
+
+def test_every_quoted_error_is_tried():
+    rows = re.findall(r"^\| .* \| `\w+Error`: (.*) \|$", read("guide/sb3.md"), re.MULTILINE)
+    assert len(rows) == len(ERRORS)
+
+
+# Figures ----------------------------------------------------------------------------------------------------------------
+
+
+def test_every_figure_is_there_and_shown_and_has_a_text():
+    shown = set()
+    for page in DOCS.rglob("*.md"):
+        text = page.read_text(encoding="utf-8")
+        for path, options in re.findall(r"^```\{figure\} (\S+)\n((?::.*\n)*)", text, re.MULTILINE):
+            assert ":alt: " in options, f"{page.name}: {path} needs an :alt:"
+            shown.add((page.parent / path).resolve())
+    assert shown == set((DOCS / "figures").resolve().glob("*.png"))
