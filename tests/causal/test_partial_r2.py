@@ -274,11 +274,28 @@ def test_standard_errors_are_those_of_one_newton_step(n_rows):
     for block in blocks_of(n_rows):
         rest = np.delete(np.arange(n_rows), block)
         deviation = x[rest].std(axis=0)[:, None]
-        score = x[block].T @ (y - x @ weights)[block] / deviation
-        step = np.sqrt(n_rows / (n_rows - 6)) * inverse @ score / len(rest) / deviation
+        score = x[block].T @ (y - x @ weights)[block]
+        step = np.sqrt(n_rows / (n_rows - 6)) * inverse @ score / len(rest)
         parts.append((weights - step) * deviation / y[rest].std(axis=0))
         shares.append(len(block) / n_rows)
     np.testing.assert_allclose(graph.standard_errors[:3].T, textbook_jackknife(weights, parts, shares), rtol=1e-4)
+
+
+@pytest.mark.parametrize("basis", ["additive", "products"])
+def test_features_that_depend_on_each_other_have_errors_of_the_size_of_those_of_others(basis):
+    """cos^2 + sin^2 = 1: the features of an angle are linearly dependent, its cosine and sine are not."""
+    rng = np.random.default_rng(0)
+    # The angle swings ever wider, so that no block is like the others
+    angle = np.linspace(0.5, np.pi, 4000) * rng.uniform(-1.0, 1.0, 4000)
+    velocity, torque = rng.standard_normal(4000), rng.uniform(-1.0, 1.0, 4000)
+    after = velocity + 0.75 * np.sin(angle) + 0.3 * torque + 0.1 * rng.standard_normal(4000)
+    moved = angle + 0.05 * after
+    now, then = [np.column_stack([np.cos(a), np.sin(a), v]) for a, v in ((angle, velocity), (moved, after))]
+    rows = np.column_stack([now, torque, then, -(after**2)]).astype(np.float32).astype(np.float64)
+    graph = discover("partial_r2", rows, TransitionVariables(("cos", "sin", "velocity"), ("torque",)), basis=basis)
+    assert graph.standard_errors.max() < 0.3
+    assert graph.masks[2, 0] < 0.1
+    assert graph.masks[2, 1:4].min() > 0.9
 
 
 @pytest.mark.parametrize("basis", ["linear", "additive", "products"])

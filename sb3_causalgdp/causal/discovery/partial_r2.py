@@ -248,7 +248,7 @@ class _Regression:
     Regresses some targets on the features of their possible causes, on all rows, by one factorisation.
 
     What a part of the rows says is one Newton step away: the second moments of the features there are taken to be those of
-    all rows, but for the features' own variances.
+    all rows.
 
     :param statistics: Where the scales and the newest rows come from
     :param moments: Of the features and, behind them, the targets
@@ -290,8 +290,8 @@ class _Regression:
         inverse = th.cholesky_inverse(factor, out=factor)
         features_of_kept = expansion.features_of(degeneracy.kept)
         self.tests = self._tests(features_of_kept, inverse)
-        # Rounding changes a step by less than 1e-7 sqrt(F) of its error for each standard deviation
-        self.inverse = inverse.float()
+        # In double precision: directions in which the features do not move have 1 / RIDGE here and next to nothing in the scores
+        self.inverse = inverse
         self.features_of_kept = th.from_numpy(features_of_kept)
         self.slopes, self.mean_slopes = self._slopes(statistics, expansion, inputs, 0.5 * deviation[inputs] / expansion.scale)
         self.whole = self._estimates(self.fit)
@@ -415,11 +415,9 @@ class _Regression:
         """
         deviation, variance, moves = self._units(rest)
         still = deviation <= SMALLEST_DEVIATION
-        inverse = th.from_numpy(~still / np.where(still, 1.0, deviation))[:, None]
         # Residuals are smaller than the errors, by the features that were fitted to them
         size = np.sqrt(self.total.count / self.freedom) / rest.count
-        step = (self.inverse @ (inverse * scores).float()).double()
-        coefficients = th.addcmul(self.fit.coefficients, inverse, step, value=-size)
+        coefficients = self.fit.coefficients - size * (self.inverse @ scores)
         coefficients[still] = 0.0
         coefficients[:, ~moves] = 0.0
         return _Fit(coefficients, deviation, variance, _residual(residual, variance))
