@@ -370,15 +370,15 @@ def seconds_per_call(call: Callable[[], Any], min_seconds: float = 0.0) -> tuple
     """
     :param call: Function without arguments
     :param min_seconds: Repeat the call until it took as many CPU seconds in all
-    :return: CPU seconds of one call, and what the last one returned
+    :return: CPU seconds of one call, the median, and what the last one returned
     """
-    start, n_calls = time.process_time(), 0
+    seconds: list[float] = []
     while True:
+        start = time.process_time()
         value = call()
-        n_calls += 1
-        spent = time.process_time() - start
-        if spent >= min_seconds:
-            return spent / n_calls, value
+        seconds.append(time.process_time() - start)
+        if sum(seconds) >= min_seconds:
+            return float(np.median(seconds)), value
 
 
 def resident_mib(largest: bool = False) -> float:

@@ -338,6 +338,7 @@ def _evaluation_section(played: Played, problem: str | None) -> Section:
 def _hyperparameter_section(run: RunFolder, model_path: Path) -> Section:
     title = "Hyperparameters"
     remarks, tables = [], []
+    rows: list[tuple[str, ...]]
     if run.entry is None:
         remarks.append("The run has no config.yml: what follows is read from the model.")
     else:

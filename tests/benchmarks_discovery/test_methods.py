@@ -4,7 +4,18 @@ import numpy as np
 import pytest
 
 from benchmarks.discovery import metrics
-from benchmarks.discovery.methods import PEERS, Outcome, allowed_edges, cut, load, load_all, run_limited, standardise
+from benchmarks.discovery.methods import (
+    PEERS,
+    Outcome,
+    agreement,
+    allowed_edges,
+    cut,
+    load,
+    load_all,
+    objective,
+    run_limited,
+    standardise,
+)
 from benchmarks.discovery.systems import generate
 from sb3_causalgdp.causal import TransitionVariables
 
@@ -34,6 +45,19 @@ def test_linear_edges_are_found(name):
 def test_lasso_of_the_same_sparsity_is_our_notears():
     rows, variables, _ = generate("linear", 1000, seed=0)
     np.testing.assert_allclose(load("lasso")(rows, variables).effects, load("notears")(rows, variables).effects, atol=2e-3)
+
+
+def test_agreement_and_objective_say_who_solves_the_same_problem():
+    rows, variables, _ = generate("linear", 1000, seed=0)
+    ours, same, other = (load(name)(rows, variables) for name in ("notears", "lasso", "correlation"))
+    gaps = agreement(same, ours)
+    assert gaps["weight_gap"] < 2e-3 and gaps["support_gap"] == 0
+    assert agreement(ours, ours) == {"weight_gap": 0.0, "support_gap": 0}
+    assert agreement(other, ours)["support_gap"] > 0
+    least, near, far = (objective(estimate.weights, rows, variables) for estimate in (ours, same, other))
+    assert least <= near + 1e-6 < far
+    # Half the variance of each of the n + 1 effects is left by no edges
+    assert objective(np.zeros_like(ours.weights), rows, variables) == pytest.approx(0.5 * (variables.n_states + 1))
 
 
 def test_a_missing_peer_is_skipped_with_a_line(monkeypatch, capsys):

@@ -290,7 +290,7 @@ class _Regression:
         inverse = th.cholesky_inverse(factor, out=factor)
         features_of_kept = expansion.features_of(degeneracy.kept)
         self.tests = self._tests(features_of_kept, inverse)
-        # In double precision: directions in which the features do not move have 1 / RIDGE here and next to nothing in the scores
+        # In double precision: where features do not move, 1 / RIDGE here meets next to nothing in the scores
         self.inverse = inverse
         self.features_of_kept = th.from_numpy(features_of_kept)
         self.slopes, self.mean_slopes = self._slopes(statistics, expansion, inputs, 0.5 * deviation[inputs] / expansion.scale)
