@@ -38,7 +38,7 @@ CAUSALGDP_METHODS: dict[str, dict[str, Any]] = {
     "direct_lingam": {"causal_discovery": "direct_lingam"},
     "perturbed": {"causal_discovery": "perturbed", "causal_discovery_kwargs": {"method": "partial_r2", "noise": 0.5}},
     "open": {"causal_discovery": all_edges_open},
-    "diffusion_ql": {"guidance": None},
+    "no_guidance": {"guidance": None},
     # Cloning a distribution means to play samples of it: not the best of ten, and none of exploration's noise
     "bc": {"eta": 0.0, "guidance": None, "n_action_candidates": 1, "exploration_noise": 0.0},
 }

@@ -22,7 +22,7 @@ LABELS = {
     "direct_lingam": "CausalGDP, DirectLiNGAM",
     "perturbed": "CausalGDP, perturbed graph",
     "open": "CausalGDP, all edges open",
-    "diffusion_ql": "Diffusion-QL (no guidance)",
+    "no_guidance": "no guidance",
     "bc": "diffusion behaviour cloning",
     "td3_bc": "TD3+BC",
     "iql": "IQL",

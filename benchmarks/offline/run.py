@@ -2,7 +2,7 @@
 The offline study: methods x tasks x seeds on maze2d, one command that goes on where it was left.
 
     export OMP_NUM_THREADS=1
-    python -m benchmarks.offline.run --methods causalgdp diffusion_ql --tasks maze2d-umaze --seeds 0 1 2 --updates 20000
+    python -m benchmarks.offline.run --methods causalgdp no_guidance --tasks maze2d-umaze --seeds 0 1 2 --updates 20000
     python -m benchmarks.offline.run --methods td3_bc iql --peer-python ~/d3rlpy-venv/bin/python
     python -m benchmarks.offline.plot
 

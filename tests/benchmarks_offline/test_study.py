@@ -29,7 +29,7 @@ def tiny_learner(method, seed=0):
 
 
 def test_a_run_reports_its_evaluations_and_its_last_and_best_checkpoint(tmp_path):
-    rows = train(TASK, "diffusion_ql", 0, tmp_path, 6, STEPS, 3, selection_episodes=2, episodes=3, overrides=QUICK)
+    rows = train(TASK, "no_guidance", 0, tmp_path, 6, STEPS, 3, selection_episodes=2, episodes=3, overrides=QUICK)
     assert [(row["checkpoint"], row["updates"]) for row in rows[:-1]] == [
         ("training", 2), ("training", 4), ("training", 6), ("last", 6)]  # fmt: skip
     assert [row["episodes"] for row in rows] == [2, 2, 2, 3, 3]
@@ -48,7 +48,7 @@ def test_an_interrupted_run_makes_only_the_updates_that_are_missing(tmp_path, mo
         done.append(n_updates)
         real(learner, n_updates)
 
-    arguments = (TASK, "diffusion_ql", 0, tmp_path, 6, STEPS, 2, 1, 1, QUICK)
+    arguments = (TASK, "no_guidance", 0, tmp_path, 6, STEPS, 2, 1, 1, QUICK)
     monkeypatch.setattr(CausalGDPLearner, "train", interrupted)
     with pytest.raises(KeyboardInterrupt):
         train(*arguments)
@@ -91,7 +91,7 @@ def test_a_restored_method_acts_as_the_saved_one_and_learns_on(method, tmp_path)
     restored.load(tmp_path / "checkpoint-2", 2)
     if not learner.plays_samples:
         assert np.array_equal(learner.predict(observations), restored.predict(observations))
-    assert learner.model.policy.is_guided == restored.model.policy.is_guided == (method not in ("diffusion_ql", "bc"))
+    assert learner.model.policy.is_guided == restored.model.policy.is_guided == (method not in ("no_guidance", "bc"))
     before = learner.predict(observations)
     restored.train(1)
     assert not np.array_equal(before, restored.predict(observations))
