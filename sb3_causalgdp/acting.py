@@ -13,6 +13,7 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.torch_layers import FlattenExtractor
+from threadpoolctl import ThreadpoolController
 from torch import nn
 
 from sb3_causalgdp.causal.world_model import MaskedBlocks, MaskedWorldModel
@@ -262,6 +263,7 @@ class NumpyActing:
         self.critics = _Critics(policy)
         self.world_model = _WorldModel(policy.world_model)
         self.rule = policy.guidance_rule
+        self._blas = ThreadpoolController().select(user_api="blas")
         self._modules = self._modules_of(policy)
         self._tensors = [tensor for module in self._modules for tensor in (*module.parameters(), *module.buffers())]
         self._addresses = [tensor.data_ptr() for tensor in self._tensors]
@@ -312,6 +314,11 @@ class NumpyActing:
         :param guided: Whether the guidance is on
         :return: Actions in [-1, 1], shape ``(batch, d)``
         """
+        # On products this small, several threads of numpy's library mostly wait for each other: ten times the time
+        with self._blas.limit(limits=1):
+            return self._act(policy, features, noise, guided)
+
+    def _act(self, policy: Policy, features: np.ndarray, noise: np.ndarray, guided: bool) -> np.ndarray:
         n_candidates = policy.n_action_candidates
         bound = self.denoiser.bind(features)
         repeated = bound if n_candidates == 1 else [np.repeat(part, n_candidates, axis=0) for part in bound]
