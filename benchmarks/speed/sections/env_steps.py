@@ -1,0 +1,78 @@
+"""Environment steps per CPU second of ``learn()`` on HalfCheetah, environment included."""
+
+from typing import Any
+
+from benchmarks.speed import contestants, learning
+from benchmarks.speed.benchmark import HALF_CHEETAH, Benchmark
+from benchmarks.speed.client import Contestant, median_ratio
+from benchmarks.speed.contestants import DEFAULT, DIFFUSION_QL, MISH_NETS, SAC, SAME_NETS
+from benchmarks.speed.results import Results, Verdict
+
+COLUMNS = ("group", "contestant", "steps per CPU second", "ms per step", "ms per refresh", "share of refreshes", "status")
+SAME = f"{DEFAULT}, ReLU 3x256"
+ONE_ENV, MANY_ENVS = "CausalGDP, default, 1 environment", "CausalGDP, default, 16 environments"
+TEN_STEPS = "CausalGDP, K=10, Mish 3x256"
+STARTS = 2_000  # two causal graphs
+
+
+def run(benchmark: Benchmark) -> None:
+    """
+    :param benchmark: What is shared
+    """
+    results = benchmark.results("env_steps")
+    starts: dict[str, Any] = {"learning_starts": STARTS}
+    ours = {**starts, "causal_refresh_freq": learning.REFRESH_PERIOD}
+    every_step = {"gradient_steps": -1, **ours}
+    groups = {
+        "beside SAC": [
+            contestants.causalgdp(DEFAULT, **ours),
+            contestants.causalgdp(SAME, policy_kwargs=SAME_NETS, **ours),
+            contestants.sb3("SAC", **starts),
+        ],
+        "K=10": [
+            contestants.causalgdp(TEN_STEPS, diffusion_steps=10, policy_kwargs=MISH_NETS, **ours),
+            *benchmark.diffusion_ql(10),
+            *benchmark.authors(),
+        ],
+        "one update for each step": [
+            contestants.causalgdp(ONE_ENV, **every_step),
+            contestants.causalgdp(MANY_ENVS, n_envs=16, **every_step),
+        ],
+    }
+    for group, who in groups.items():
+        _measure(benchmark, results, group, who)
+    results.verdicts = [
+        _verdict(results, "env steps: CausalGDP default, guided, vs SB3 SAC 3x256", DEFAULT, SAC, 1.0, 1.4),
+        _verdict(results, "env steps: CausalGDP default with 3x256, guided, vs SB3 SAC 3x256", SAME, SAC, 1.0, 1.4),
+        _verdict(results, "env steps, K=10: CausalGDP Mish 3x256 vs Diffusion-QL in a plain loop", TEN_STEPS, DIFFUSION_QL),
+        _verdict(results, "env steps: 16 environments vs 1, equal updates per step", MANY_ENVS, ONE_ENV, 1.3, 2.0),
+    ]
+    results.write(COLUMNS)
+
+
+def _measure(benchmark: Benchmark, results: Results, group: str, who: list[Contestant]) -> None:
+    args = benchmark.args
+    with benchmark.field(who, transitions=benchmark.transitions(HALF_CHEETAH), env=HALF_CHEETAH) as field:
+        turns = field.interleaved(
+            args.learn_rounds,
+            lambda worker: learning.turn(worker, args.steps),
+            lambda worker: learning.warm_up(worker, STARTS),
+        )
+        results.about |= {name: worker.about for name, worker in field.workers.items()}
+        results.rows += [{"group": group, "contestant": one.name, **learning.row(field, one.name, turns)} for one in who]
+
+
+def _verdict(
+    results: Results, what: str, name: str, reference: str, must: float | None = None, goal: float | None = None
+) -> Verdict:
+    seconds = {row["contestant"]: row for row in results.rows if row["status"] == "ok"}
+    missing = [one for one in (name, reference) if one not in seconds]
+    if missing:
+        return Verdict(what, None, must, goal, note=f"not available: {missing[0]}")
+    return Verdict(what, median_ratio(*(_with_refreshes(seconds[one]) for one in (reference, name))), must, goal)
+
+
+def _with_refreshes(row: dict[str, Any]) -> list[float]:
+    """Milliseconds per step of each turn."""
+    refresh = (row["ms per refresh"] or 0.0) / learning.REFRESH_PERIOD
+    return [1e3 * turn["seconds"] / turn["steps"] + refresh for turn in row["turns"]]

@@ -1,0 +1,33 @@
+"""What can be asked of every contestant whose update is PyTorch's."""
+
+from typing import Any, Protocol
+
+import torch as th
+
+from benchmarks.speed.workers import matmuls
+
+# The environment says one thread as well; this also holds where PyTorch was built without OpenMP
+th.set_num_threads(1)
+
+
+class _Updates(Protocol):
+    def update(self, n: int) -> None: ...
+
+
+class TorchContestant:
+    """Floating point operations and matrix products of one update; the rate of the machine's own."""
+
+    # Means over two updates: TD3's actor has only every second one
+    def flops(self: _Updates) -> dict[str, float]:
+        """Floating point operations of one update."""
+        return {name: count / 2 for name, count in matmuls.count_flops(lambda: self.update(2)).items()}
+
+    def products(self: _Updates) -> dict[str, float]:
+        """Seconds of one update's matrix products, each layout alone."""
+        return {name: value / 2 for name, value in matmuls.products_alone(lambda: self.update(2)).items()}
+
+    def layer_rates(self, shapes: list[tuple[int, int, int]]) -> dict[str, Any]:
+        """
+        :param shapes: Batch, inputs and outputs of dense layers
+        """
+        return {"x".join(map(str, shape)): matmuls.layer_rate(*shape) for shape in shapes}
