@@ -29,7 +29,8 @@ def run(benchmark: Benchmark) -> None:
         *benchmark.diffusion_ql(),
         *benchmark.authors(),
     ]
-    small = _measure(benchmark, results, HALF_CHEETAH, [*contestants.our_settings(), *peers], benchmark.updates)
+    ours = [one for one in contestants.our_settings() if not (args.no_compile and one.config["kwargs"].get("compile"))]
+    small = _measure(benchmark, results, HALF_CHEETAH, [*ours, *peers], benchmark.updates)
     wide = [one for one in contestants.our_settings() if one.name in (DEFAULT, ONE_STEP, CHAIN)]
     wide += [contestants.sb3("SAC"), *benchmark.diffusion_ql(), *benchmark.authors()]
     large = _measure(benchmark, results, HUMANOID, wide, HUMANOID_UPDATES)
