@@ -103,14 +103,21 @@ def test_other_scripts_are_started_through_our_entry_point(monkeypatch):
 def test_a_training_is_filmed(zoo, logs, monkeypatch):
     from sb3_causalgdp.zoo import scripts
 
+    call = scripts.subprocess.call
+    started = []
+
     def in_this_process(command, *args, **kwargs):
-        assert command[:3] == [sys.executable, "-m", "sb3_causalgdp.zoo"]
+        # imageio looks whether ffmpeg can be called, in its first use in a process
+        if command[:3] != [sys.executable, "-m", "sb3_causalgdp.zoo"]:
+            return call(command, *args, **kwargs)
+        started.append(command[3])
         zoo(*command[3:])
         return 0
 
     with monkeypatch.context() as patches:
         patches.setattr(scripts.subprocess, "call", in_this_process)
         zoo("record_training", *PENDULUM, "-f", "logs", "--exp-id", 1, "-n", 3)
+    assert started == ["record_video"] * 3
     videos = logs / "causalgdp" / "Pendulum-v1_1" / "videos"
     assert (videos / "training.mp4").stat().st_size > 0
     assert len(list(videos.glob("*-Pendulum-v1-step-*.mp4"))) == 3  # checkpoint, final and best model
