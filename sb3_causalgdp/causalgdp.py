@@ -607,7 +607,7 @@ class CausalGDP(OfflineToOnlineAlgorithm):
         if guided:
             rule = self.policy.guidance_rule
             state, next_state = self.policy.causal_state(observations), self.policy.causal_state(transitions.next_observations)
-            guidance = self.policy.make_guidance(state, next_state, next_actions)
+            guidance = self.policy.make_guidance(state, next_state, next_actions, climbed)
         denoising, clean_actions = denoising_loss(
             self.actor.denoiser, self.actor.schedule, features, transitions.actions, guidance, rule
         )

@@ -51,17 +51,20 @@ def activation_class(activation_fn: str | type[nn.Module]) -> type[nn.Module]:
     return ACTIVATIONS[activation_fn.lower()]
 
 
-def q_values(critic: ContinuousCritic, features: th.Tensor, actions: th.Tensor) -> list[th.Tensor]:
+def q_values(
+    critic: ContinuousCritic, features: th.Tensor, actions: th.Tensor, networks: slice = slice(None)
+) -> list[th.Tensor]:
     """
     What each critic network says of features that are known already; the critic itself extracts them anew.
 
     :param critic: The critics
     :param features: Shape ``(batch, features_dim)``
     :param actions: In [-1, 1], shape ``(batch, d)``
+    :param networks: Which of the networks, all by default
     :return: One tensor of shape ``(batch, 1)`` for each network
     """
     inputs = th.cat([features, actions], dim=1)
-    return [network(inputs) for network in critic.q_networks]
+    return [network(inputs) for network in critic.q_networks[networks]]
 
 
 class DiffusionActor(BasePolicy):
@@ -448,20 +451,22 @@ class CausalGDPPolicy(BasePolicy):
             start += size
         return extractor(parts)
 
-    def value_gradient(self, state: th.Tensor, action: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+    def value_gradient(self, state: th.Tensor, action: th.Tensor, critic: int | None = None) -> th.Tensor:
         """
-        The smallest target Q at a predicted state, and its gradient by the state.
+        Gradient of the target Q at a predicted state by the state.
 
         :param state: Shape ``(batch, n)``
         :param action: The action that follows, held fixed, shape ``(batch, d)``
-        :return: Shapes ``(batch,)`` and ``(batch, n)``, without a graph
+        :param critic: The critic whose Q it is; None takes the smallest Q of all
+        :return: Shape ``(batch, n)``, without a graph
         """
+        networks = slice(None) if critic is None else slice(critic, critic + 1)
         with th.enable_grad():
             state = state.detach().requires_grad_()
             features = state if self.has_image_state else self._features_of_state(state, self.critic_target.features_extractor)
-            value = th.cat(q_values(self.critic_target, features, action), dim=1).amin(dim=1)
-            (gradient,) = th.autograd.grad(value.sum(), state)
-        return value.detach(), gradient
+            values = q_values(self.critic_target, features, action, networks)
+            (gradient,) = th.autograd.grad(th.cat(values, dim=1).amin(dim=1).sum(), state)
+        return gradient
 
     # Guidance -----------------------------------------------------------------------------------------------------------
 
@@ -470,17 +475,20 @@ class CausalGDPPolicy(BasePolicy):
         """Whether samples are steered: the guidance is on and the causal graph has been found."""
         return self.guidance_rule is not None and max(self.guidance_rule.scales) > 0.0 and bool(self.guidance_ready > 0.0)
 
-    def make_guidance(self, state: th.Tensor, next_state: th.Tensor, next_action: th.Tensor) -> CausalGuidance:
+    def make_guidance(
+        self, state: th.Tensor, next_state: th.Tensor, next_action: th.Tensor, critic: int | None = None
+    ) -> CausalGuidance:
         """
         :param state: s, shape ``(batch, n)``
         :param next_state: s* that is wished for, shape ``(batch, n)``
         :param next_action: The action that would follow in s*, for the return target, shape ``(batch, d)``
+        :param critic: The critic that the return target climbs; None takes the smallest Q of all
         :return: The guidance for these states
         """
         outcome: OutcomeTarget
         if self.guidance_target == "return":
             outcome = ReturnTarget(
-                lambda predicted: self.value_gradient(predicted, next_action), self.discount, self.return_std
+                lambda predicted: self.value_gradient(predicted, next_action, critic), self.discount, self.return_std
             )
         else:
             outcome = RewardTarget(self.reward_target)

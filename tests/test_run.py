@@ -311,7 +311,10 @@ def test_with_n_step_returns_the_guidance_asks_for_the_next_step(monkeypatch):
     # The action that follows is the target's for that next state
     monkeypatch.setattr(model.actor_target, "sample", lambda features: features / 1000.0)
     model.train(gradient_steps=4, batch_size=8)
-    for (state, next_state, next_action), (transitions, next_actions) in zip(asked, model.seen["actor"][-4:], strict=True):
+    for (state, next_state, next_action, critic), (transitions, next_actions) in zip(
+        asked, model.seen["actor"][-4:], strict=True
+    ):
+        assert critic in (0, 1)
         assert th.equal(state, transitions.observations)
         assert th.equal(next_state, transitions.observations + th.tensor([1.0, 0.0]))
         assert next_action is next_actions

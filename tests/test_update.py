@@ -28,6 +28,25 @@ def trained_model(**kwargs):
     return model
 
 
+# The value that the guidance climbs ------------------------------------------------------------------------------------
+
+
+def test_the_guidance_in_the_loss_climbs_one_critic_and_in_acting_the_smallest():
+    policy = trained_model().policy
+    states, actions = th.randn(64, 3), th.rand(64, 1) * 2.0 - 1.0
+
+    def gradients(value):
+        leaf = states.clone().requires_grad_()
+        return th.autograd.grad(value(q_values(policy.critic_target, leaf, actions)).sum(), leaf)[0]
+
+    first, second = (gradients(lambda values, i=i: values[i]) for i in (0, 1))
+    smallest = gradients(lambda values: th.minimum(*values))
+    assert not th.allclose(first, smallest) and not th.allclose(second, smallest)
+    th.testing.assert_close(policy.value_gradient(states, actions, critic=0), first)
+    th.testing.assert_close(policy.value_gradient(states, actions, critic=1), second)
+    th.testing.assert_close(policy.value_gradient(states, actions), smallest)
+
+
 # The action that the Q term judges --------------------------------------------------------------------------------------
 
 

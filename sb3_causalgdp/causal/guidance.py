@@ -49,20 +49,18 @@ class ReturnTarget:
 
     Sees as far as the critics do (a one-step value expansion).
 
-    :param value_gradient: Gives V and dV / ds' at next states, shapes ``(batch,)`` and ``(batch, n)``
+    :param value_gradient: Gives dV / ds' at next states, shape ``(batch, n)``
     :param discount: Discount factor gamma
     :param std: Standard deviation of Q, shape ``()``
     """
 
-    def __init__(
-        self, value_gradient: Callable[[th.Tensor], tuple[th.Tensor, th.Tensor]], discount: float, std: th.Tensor
-    ) -> None:
+    def __init__(self, value_gradient: Callable[[th.Tensor], th.Tensor], discount: float, std: th.Tensor) -> None:
         self.value_gradient = value_gradient
         self.discount = discount
         self.std = std
 
     def __call__(self, response: ActionResponse) -> OutcomeTerm:
-        _, by_state = self.value_gradient(response.next_state)
+        by_state = self.value_gradient(response.next_state)
         through_value = (by_state.unsqueeze(2) * response.next_state_jacobian).sum(dim=1)
         jacobian = (response.reward_jacobian + self.discount * through_value) / self.std
         return OutcomeTerm(th.ones_like(response.reward), jacobian)
