@@ -13,6 +13,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.type_aliases import PyTorchObs
 
+from sb3_causalgdp.causal import min_rows
 from sb3_causalgdp.diagnostics import guidance_divergence, step_size_bound
 
 
@@ -81,7 +82,7 @@ class CausalWorldModelCallback(BaseCallback):
         variables, statistics = model.transition_variables, model.causal_statistics
         n_causes = variables.n_states + variables.n_actions
         wanted = max(200, 10 * n_causes) if self.min_transitions is None else self.min_transitions
-        needed = max(wanted, 2 * n_causes + 4)  # what any method needs
+        needed = max(wanted, min_rows(model.discovery, variables))
         if statistics.n_samples < needed:
             self._say_too_few(statistics.n_samples, needed)
             return

@@ -194,7 +194,7 @@ class CausalGDPPolicy(BasePolicy):
     :param optimizer_kwargs: Its keyword arguments, without the learning rate
     :param n_critics: Number of critics
     :param share_features_extractor: Whether actor and critics share one features extractor
-    :param world_model_net_arch: Hidden layers of the world model, all of one size
+    :param world_model_net_arch: Hidden layers of the world model, all of one size, ``[128, 128]`` by default
     :param diffusion_steps: Number of diffusion steps K
     :param noise_schedule: ``vp``, ``linear`` or ``cosine``
     :param sampler: ``ddpm`` or ``ddim``

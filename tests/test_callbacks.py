@@ -349,3 +349,16 @@ def test_the_history_spans_the_training_in_a_bounded_number_of_graphs():
     assert len(history) <= model.GRAPHS_IN_HISTORY
     assert history[-1] == 199 and history[0] == 0 and history == sorted(history)
     assert "causal_graph_history" in model._excluded_save_params()
+
+
+@pytest.mark.parametrize("method", ["notears", "partial_r2", "world_model"])
+def test_the_first_graph_waits_for_as_many_transitions_as_the_method_needs(method):
+    """Pendulum has four causes: world_model needs 14 transitions, partial_r2 12 and notears 6."""
+    needed = {"notears": 6, "partial_r2": 12, "world_model": 14}[method]
+    model = make(causal_discovery=method, learning_starts=100, train_freq=1)
+    callback = CausalWorldModelCallback(refresh_freq=1, min_transitions=1, diagnostics_batch_size=0)
+    with pytest.warns(UserWarning, match=rf"Causal discovery waits: it has 0 transitions and needs {needed}"):
+        model.learn(needed, callback=callback)  # the last transition is stored after the last refresh
+    assert model._causal_graph is None
+    model.learn(1, callback=callback, reset_num_timesteps=False)
+    assert model.causal_graph().n_samples == needed

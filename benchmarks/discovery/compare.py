@@ -145,6 +145,11 @@ def machine() -> Record:
     return {"processor": processor, "threads": os.environ.get("OMP_NUM_THREADS"), "versions": versions}
 
 
+def _auroc(scores: np.ndarray, truth: np.ndarray) -> float | None:
+    """None, which the table leaves out, where there are no edges or nothing else."""
+    return metrics.auroc(scores, truth) if 0 < truth.sum() < truth.size else None
+
+
 def graph_scores(estimate: Estimate, system: ControlSystem) -> Record:
     """
     :param estimate: What a method says
@@ -153,10 +158,19 @@ def graph_scores(estimate: Estimate, system: ControlSystem) -> Record:
     """
     where = system.scored
     truth = system.adjacency[where]
+    folded = system.fold_copies(estimate.ranking)
     ranking, masks, effects = (system.fold_copies(matrix)[where] for matrix in estimate[:3])
+    n_states = len(where) - 1
+    blocks = {
+        "state": np.s_[:n_states, :n_states],
+        "action": np.s_[:n_states, n_states:],
+        "reward": np.s_[n_states:],
+    }
+    by_block = {f"auroc_{name}": _auroc(folded[b][where[b]], system.adjacency[b][where[b]]) for name, b in blocks.items()}
     return {
-        "auroc": metrics.auroc(ranking, truth),
-        "auroc_effects": metrics.auroc(effects, truth),
+        "auroc": _auroc(ranking, truth),
+        **by_block,
+        "auroc_effects": _auroc(effects, truth),
         "f1": metrics.f1(masks, truth),
         "shd": metrics.shd(masks, truth),
         "brier": metrics.brier(masks, truth) if estimate.probabilities else None,
@@ -208,7 +222,8 @@ def run_accuracy(args: argparse.Namespace, fits: dict[str, Fit]) -> None:
                     outcome = run_limited(partial(fit, rows, system.variables), args.time_limit)
                     scores = graph_scores(outcome.value, system) if outcome.status == "ok" else {}
                     results.add(key | timed(outcome) | scores)
-    columns = ("auroc", "auroc_effects", "f1", "shd", "brier", "ece", "cpu_seconds")
+    blocks = ("auroc_state", "auroc_action", "auroc_reward")
+    columns = ("auroc", *blocks, "auroc_effects", "f1", "shd", "brier", "ece", "cpu_seconds")
     results.write_table(("rows", "system", "method"), columns, mean_or_nan)
 
 
@@ -283,9 +298,9 @@ def _gather_and_refresh(system: ControlSystem, n_rows: int, name: str, kwargs: d
     gathering = 0.0
     for _ in range(n_rows // block - 1):
         rows = system.sample(block, rng)
-        start = time.process_time()
+        start = time.thread_time()
         statistics.update(rows)
-        gathering += time.process_time() - start
+        gathering += time.thread_time() - start
     seconds = seconds_per_call(partial(refresh, name, statistics, variables, **kwargs), MIN_TIMED_SECONDS)[0]
     return {"gather_seconds": gathering, "refresh_seconds": seconds}
 
@@ -319,9 +334,9 @@ def _humanoid(name: str, rows: np.ndarray, variables: TransitionVariables, kwarg
     method, seconds, graph = make_discovery(name, **kwargs), [], None
     for new in (first[:0], rest):
         statistics.update(new)
-        start = time.process_time()
+        start = time.thread_time()
         graph = method(statistics, variables, graph)
-        seconds.append(time.process_time() - start)
+        seconds.append(time.thread_time() - start)
     assert graph is not None
     return {
         "first_seconds": seconds[0],

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import torch as th
 
+from sb3_causalgdp.causal.matrices import cholesky_in_place
 from sb3_causalgdp.causal.variables import TransitionVariables
 
 DEPENDENT_SHARE = 1e-8  # of a variable's variance left by the others; rounding of float32 leaves 1e-14
@@ -65,8 +66,11 @@ def variance_inflation(correlation: np.ndarray, n_last: int) -> np.ndarray:
 
 def _factor(correlation: np.ndarray) -> th.Tensor:
     """Lower Cholesky factor without pivoting, shape (p, p); its squared diagonal is what the variables before one leave."""
-    moving = np.diagonal(correlation) > 0.0
-    return th.linalg.cholesky(th.from_numpy(correlation + np.diag(np.where(moving, RIDGE, 1.0))))
+    matrix = correlation.copy()
+    diagonal = np.einsum("ii->i", matrix)
+    diagonal[diagonal == 0.0] = 1.0
+    diagonal += RIDGE
+    return cholesky_in_place(matrix)
 
 
 def _degeneracy(correlation: np.ndarray, factor: th.Tensor) -> Degeneracy:
@@ -75,28 +79,23 @@ def _degeneracy(correlation: np.ndarray, factor: th.Tensor) -> Degeneracy:
     sure, others = moving[left > SUSPICIOUS_SHARE], moving[left <= SUSPICIOUS_SHARE]
     if len(others) == 0:
         return Degeneracy(moving, (), {})
-    of_sure = th.linalg.cholesky(_part(correlation, sure, sure))
-    explained = th.linalg.solve_triangular(of_sure, _part(correlation, sure, others), upper=False)
-    pivots, factor = _pivots((_part(correlation, others, others) - explained.T @ explained).numpy())
+    of_others = correlation[others]
+    of_sure = cholesky_in_place(correlation[sure][:, sure])
+    explained = th.linalg.solve_triangular(of_sure, th.from_numpy(of_others[:, sure]).T, upper=False)
+    pivots, factor = _pivots((th.from_numpy(of_others[:, others]) - explained.T @ explained).numpy())
     kept, rest = np.concatenate([sure, others[pivots]]), np.setdiff1d(np.arange(len(others)), pivots)
     if len(rest) == 0:
         return Degeneracy(np.sort(kept), (), {})
     # What the kept ones say about each dependent one: back through both factors
     of_pivots = th.linalg.solve_triangular(factor[:, pivots], factor[:, rest], upper=True)
-    of_others = th.linalg.solve_triangular(of_sure.T, explained[:, rest] - explained[:, pivots] @ of_pivots, upper=True)
-    coefficients = th.cat([of_others, of_pivots]).numpy()
-    dependent, strongest = others[rest], np.abs(coefficients).argmax(axis=0)
-    stand_in = {
-        int(variable): (int(kept[row]), float(np.sign(coefficients[row, j])))
-        for j, (variable, row) in enumerate(zip(dependent, strongest, strict=True))
-    }
-    members = [{int(v), *kept[np.abs(coefficients[:, j]) > SMALLEST_COEFFICIENT].tolist()} for j, v in enumerate(dependent)]
-    return Degeneracy(np.sort(kept), _merged_groups(members, set(dependent.tolist())), stand_in)
-
-
-def _part(matrix: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> th.Tensor:
-    # Twice as fast as np.ix_
-    return th.from_numpy(matrix[rows][:, columns])
+    of_rest = th.linalg.solve_triangular(of_sure.T, explained[:, rest] - explained[:, pivots] @ of_pivots, upper=True)
+    stand_in, members = {}, []
+    for variable, coefficients in zip(others[rest].tolist(), th.cat([of_rest, of_pivots]).T.numpy(), strict=True):
+        sizes = np.abs(coefficients)
+        strongest = int(sizes.argmax())
+        stand_in[variable] = int(kept[strongest]), float(np.sign(coefficients[strongest]))
+        members.append({variable, *kept[sizes > SMALLEST_COEFFICIENT].tolist()})
+    return Degeneracy(np.sort(kept), _merged_groups(members, set(stand_in)), stand_in)
 
 
 def _pivots(remaining: np.ndarray) -> tuple[list[int], th.Tensor]:
@@ -115,8 +114,8 @@ def _pivots(remaining: np.ndarray) -> tuple[list[int], th.Tensor]:
             break
         factor[row] = (remaining[pivot] - factor[:row, pivot] @ factor[:row]) / np.sqrt(left[pivot])
         left -= factor[row] ** 2
+        left[pivot] = -np.inf
         pivots.append(pivot)
-        left[pivots] = 0.0
     return pivots, th.from_numpy(factor[: len(pivots)])
 
 

@@ -1,6 +1,8 @@
 """RL Zoo's experiment manager, for CausalGDP's entries, its offline stage and its search space."""
 
 import os
+import shlex
+import sys
 import time
 import traceback
 import warnings
@@ -14,10 +16,12 @@ from typing import Any
 
 import optuna
 import torch as th
+import yaml
 from rl_zoo3 import exp_manager
 from rl_zoo3.exp_manager import ExperimentManager
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback, EvalCallback
+from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_causalgdp import CausalGDP
 from sb3_causalgdp.offline.callbacks import NormalizedEvalCallback
@@ -26,13 +30,15 @@ from sb3_causalgdp.zoo.hyperparameters import SCHEDULES, hyperparameter_file, ma
 from sb3_causalgdp.zoo.offline_tasks import OFFLINE_TASKS
 from sb3_causalgdp.zoo.registration import ALGORITHM, SetupError
 from sb3_causalgdp.zoo.search_space import sample_causalgdp_params
+from sb3_causalgdp.zoo.versions import installed_versions
 
 DIVERGENCE_CALLBACK = "sb3_causalgdp.zoo.callbacks.StopOnDivergence"
 
 
 class CausalGDPExperimentManager(ExperimentManager):
     """
-    RL Zoo's manager. For other algorithms it is that one, except that what is wrong before the training is a ``SetupError``.
+    RL Zoo's manager. For other algorithms it is that one, except that what is wrong before the training is a ``SetupError``, and
+    that versions and the exact command are recorded.
 
     Without ``config``, the hyperparameters of CausalGDP are those of our own file.
 
@@ -99,6 +105,29 @@ class CausalGDPExperimentManager(ExperimentManager):
         given = self.specified_callbacks or []
         self.specified_callbacks = [*(given if isinstance(given, list) else [given]), DIVERGENCE_CALLBACK]
         return {**rest, **schedules}, env_wrapper, callbacks, vec_env_wrapper
+
+    # Files ----------------------------------------------------------------------------------------------------------------
+
+    def _save_config(self, saved_hyperparams: dict[str, Any]) -> None:
+        super()._save_config(saved_hyperparams)
+        folder = Path(self.params_path)
+        # RL Zoo's command lacks the shell's quotes
+        (folder / "command.txt").write_text(shlex.join(sys.orig_argv), encoding="utf-8")
+        versions = yaml.safe_dump(installed_versions(), sort_keys=False, allow_unicode=True)
+        (folder / "versions.yml").write_text(versions, encoding="utf-8")
+
+    def _load_pretrained_agent(self, hyperparams: dict[str, Any], env: VecEnv) -> BaseAlgorithm:
+        model = super()._load_pretrained_agent(hyperparams, env)
+        if isinstance(model, CausalGDP):
+            # The steps of the new run begin at 0, and so does the history that it saves
+            model.causal_graph_history = []
+        return model
+
+    def save_trained_model(self, model: BaseAlgorithm) -> None:
+        super().save_trained_model(model)
+        if isinstance(model, CausalGDP):
+            # Again, with what RL Zoo does not ask for
+            model.save(f"{self.save_path}/{self.env_name}", include=["causal_graph_history"])
 
     # Training -----------------------------------------------------------------------------------------------------------
 

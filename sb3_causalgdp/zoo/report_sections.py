@@ -1,7 +1,6 @@
 """What stands on the page about a run."""
 
 import base64
-import importlib.metadata
 import io
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -13,17 +12,16 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 from stable_baselines3.common.save_util import load_from_pkl
-from stable_baselines3.common.utils import get_system_info
 
-from sb3_causalgdp import CausalGDP, __version__
+from sb3_causalgdp import CausalGDP
 from sb3_causalgdp.causal import CausalGraph
 from sb3_causalgdp.causal.plots import plot_causal_graph, plot_history
 from sb3_causalgdp.diagnostics import step_divergences
 from sb3_causalgdp.pictures import draw_transitions, plot_guidance_strength, policy_input
 from sb3_causalgdp.zoo.hyperparameters import constructor_arguments
 from sb3_causalgdp.zoo.run_folder import Evaluations, RunFolder, saved_attributes, saved_versions
+from sb3_causalgdp.zoo.versions import installed_versions
 
-PACKAGES = ("rl_zoo3", "mujoco", "gymnasium-robotics", "minari")
 OBSERVATIONS = 2_000  # on which the effects of the actions are averaged
 GUIDANCE_OBSERVATIONS = 256
 MOST_EDGES = 20
@@ -125,7 +123,7 @@ def make_sections(
         _guidance_section(model, transitions),
         _evaluation_section(played, problem),
         _hyperparameter_section(run, model_path),
-        _version_section(model_path),
+        _version_section(run, model_path),
         _command_section(run),
     ]
 
@@ -264,7 +262,7 @@ def _graph_section(model: CausalGDP) -> Section:
 
 def _history_section(run: RunFolder, model: CausalGDP) -> Section:
     title = "History of the graph"
-    graphs, source = list(model.causal_graph_history), "the model's causal_graph_history"
+    graphs, source = run.graph_history(), "the model at the end of the training"
     if len(graphs) < 2:
         graphs, source = run.checkpoint_graphs(), "the checkpoints (--save-freq), each of which holds the graph of its time"
         newest = model._causal_graph
@@ -273,8 +271,7 @@ def _history_section(run: RunFolder, model: CausalGDP) -> Section:
             graphs = [*before, newest]
     if len(graphs) < 2:
         known = "one graph is known" if graphs else "no graph is known"
-        hint = 'or save the model with model.save(path, include=["causal_graph_history"])'
-        return Section(title, [f"There is none: {known}. Train with --save-freq: checkpoints hold their graphs, {hint}."])
+        return Section(title, [f"There is none: {known}. The model at the end of a training holds them, and so do checkpoints."])
     first, last = graphs[0], graphs[-1]
     caption = "Masks over the training, with the signs of the effects; number of edges, and how much the masks changed."
     return Section(
@@ -357,22 +354,16 @@ def _hyperparameter_section(run: RunFolder, model_path: Path) -> Section:
     return Section(title, remarks, tables=tables)
 
 
-def _version_section(model_path: Path) -> Section:
-    then, now = saved_versions(model_path), get_system_info(print_info=False)[0]
-    now["sb3_causalgdp"] = __version__
-    for package in PACKAGES:
-        try:
-            now[package] = importlib.metadata.version(package)
-        except importlib.metadata.PackageNotFoundError:
-            now[package] = "not installed"
-    rows = [(name, then.get(name, "not recorded"), now.get(name, "")) for name in {**then, **now}]
-    return Section("Versions", tables=[Table(("", "where the model was saved", "where this page was written"), rows)])
+def _version_section(run: RunFolder, model_path: Path) -> Section:
+    then, now = {**saved_versions(model_path), **run.versions}, installed_versions()
+    rows = [(name, str(then.get(name, "not recorded")), now.get(name, "")) for name in {**then, **now}]
+    return Section("Versions", tables=[Table(("", "where it was trained", "where this page was written"), rows)])
 
 
 def _command_section(run: RunFolder) -> Section:
     if run.command is None:
         return Section("Command", ["Not recorded: the run has no command.txt."])
-    return Section("Command", ["As RL Zoo recorded it, which drops the shell's quotes."], texts=[run.command])
+    return Section("Command", texts=[run.command])
 
 
 # Text and pictures ------------------------------------------------------------------------------------------------------

@@ -77,8 +77,13 @@ class RunFolder:
 
     @property
     def command(self) -> str | None:
-        """The command of the training, as RL Zoo wrote it."""
+        """The command of the training."""
         return self._text("command.txt")
+
+    @property
+    def versions(self) -> Mapping[str, Any]:
+        """What was installed when the training started, empty if the run does not say."""
+        return self._settings("versions.yml") or {}
 
     # Models ---------------------------------------------------------------------------------------------------------------
 
@@ -97,6 +102,13 @@ class RunFolder:
         """
         matches = [(CHECKPOINT_NAME.fullmatch(path.name), path) for path in self.path.glob("rl_model_*_steps.zip")]
         return sorted((int(match[1]), path) for match, path in matches if match is not None)
+
+    def graph_history(self) -> list[CausalGraph]:
+        """
+        :return: The causal graphs that the model at the end of the training holds, oldest first; empty without that model
+        """
+        final = self.models().get("final")
+        return [] if final is None else saved_attributes(final).get("causal_graph_history", [])
 
     def checkpoint_graphs(self) -> list[CausalGraph]:
         """

@@ -12,6 +12,7 @@ WORLD_MODELS = {"small": [64, 64], "medium": [128, 128, 128], "big": [256, 256, 
 # The first two of these need no optional package
 DISCOVERY_METHODS = ["partial_r2", "notears"]
 GUIDANCE_TARGETS = ["return", "reward", "none"]
+ACTOR_UPDATES = ["one_step", "chain"]
 
 
 def sample_causalgdp_params(
@@ -44,6 +45,7 @@ def sample_causalgdp_params(
     # The paper's table has eta from 0.005 to 5; a denoising weight of 1 is for fixed datasets
     trial.suggest_float("eta", 0.005, 5.0, log=True)
     trial.suggest_float("denoising_weight", 0.005, 1.0, log=True)
+    trial.suggest_categorical("actor_update", ACTOR_UPDATES)
     trial.suggest_int("diffusion_steps", 2, 16, log=True)
     trial.suggest_int("n_action_candidates_pow", 0, 5)
     trial.suggest_float("exploration_noise", 0.05, 0.5, log=True)

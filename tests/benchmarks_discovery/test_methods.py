@@ -81,6 +81,10 @@ def test_a_child_returns_its_value_its_seconds_or_its_error():
     assert failed.status == "failed" and "ZeroDivisionError" in failed.error
 
 
+def test_seconds_of_a_child_are_finer_than_the_ticks_of_its_limit():
+    assert 0.0 < run_limited(lambda: sum(range(10_000)), limit_s=20).cpu_seconds < 2e-3
+
+
 def test_a_child_over_its_limit_is_ended():
     def endless() -> Outcome:
         while True:

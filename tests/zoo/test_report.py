@@ -10,6 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import yaml
 from stable_baselines3.common.save_util import data_to_json
 
 pytest.importorskip("rl_zoo3")
@@ -102,7 +103,7 @@ def run(trained, folder):
 
 @pytest.fixture(scope="module")
 def full_page(zoo, trained, tmp_path_factory):
-    """The page of a run that lacks nothing, and the history that RL Zoo does not save."""
+    """The page of a run that lacks nothing, with a graph that changed."""
     folder = tmp_path_factory.mktemp("full")
     shutil.copytree(trained, folder / "run_1")
     add_history(folder / "run_1" / "Pendulum-v1.zip")
@@ -112,7 +113,7 @@ def full_page(zoo, trained, tmp_path_factory):
 
 
 def add_history(path):
-    """As model.save(path, include=["causal_graph_history"]) does."""
+    """An earlier graph that differs in one edge."""
     from sb3_causalgdp import CausalGDP
 
     model = CausalGDP.load(path, device="cpu")
@@ -160,8 +161,26 @@ def test_it_says_what_the_run_was(full_page):
     assert "Stable-Baselines3" in full_page.text("Versions") and "rl_zoo3" in full_page.text("Versions")
 
 
-def test_it_shows_the_command_as_it_was_recorded(run):
-    assert RunFolder(run).command == (run / "Pendulum-v1" / "command.txt").read_text()
+def test_it_shows_the_exact_command(full_page, trained):
+    assert full_page.text("Command") == f"Command {(trained / 'Pendulum-v1' / 'command.txt').read_text()} "
+
+
+def test_it_shows_what_was_installed_where_it_was_trained(zoo, run):
+    path = run / "Pendulum-v1" / "versions.yml"
+    versions = yaml.safe_load(path.read_text())
+    path.write_text(yaml.safe_dump({**versions, "rl_zoo3": "2.0.0", "mujoco": 3.1}))
+    zoo("report", run, "--load-best", "--episodes", 0)
+    page = Page(run / "report.html")
+    assert f"rl_zoo3 2.0.0 {versions['rl_zoo3']} " in page.text("Versions")
+    assert f"mujoco 3.1 {versions['mujoco']} " in page.text("Versions")
+
+
+def test_the_history_is_that_of_the_run_whichever_model_is_shown(zoo, run):
+    add_history(run / "Pendulum-v1.zip")
+    zoo("report", run, "--load-best", "--episodes", 0)
+    page = Page(run / "report.html")
+    assert "best_model.zip (best)" in page.text("Summary")
+    assert "2 graphs, from the model at the end of the training" in page.text("History of the graph")
 
 
 def test_evaluations_stand_on_the_page(full_page, trained):

@@ -3,10 +3,12 @@
 import importlib.util
 import os
 import pickle
+import shlex
 import shutil
 import signal
 import subprocess
 import sys
+from importlib.metadata import version
 from pathlib import Path
 
 import gymnasium as gym
@@ -14,6 +16,7 @@ import numpy as np
 import pytest
 import yaml
 
+import sb3_causalgdp
 from sb3_causalgdp import CausalGDP
 
 pytest.importorskip("rl_zoo3")
@@ -56,7 +59,7 @@ def test_training_saves_models_evaluations_and_what_they_were_made_with(trained)
     assert config["diffusion_steps"] == 2 and config["n_timesteps"] == 10_000
     model = CausalGDP.load(run / "Pendulum-v1.zip", device="cpu")
     assert (model.num_timesteps, model.diffusion_steps, model.actor.net_arch) == (260, 2, [8])
-    assert model.causal_graph().num_timesteps == 250
+    assert [graph.num_timesteps for graph in model.causal_graph_history] == [250]
     assert CausalGDP.load(run / "rl_model_200_steps.zip", device="cpu").num_timesteps == 200
 
 
@@ -65,6 +68,17 @@ def test_a_continued_training_starts_from_the_model_and_its_transitions(trained)
     first = CausalGDP.load(trained / "causalgdp" / "Pendulum-v1_1" / "Pendulum-v1.zip", device="cpu")
     assert model._n_updates > first._n_updates > 0
     assert model._stored_position == first._stored_position + 100
+    # Its steps begin at 0, and so does its history
+    assert model.causal_graph().num_timesteps == 250 and model.causal_graph_history == []
+
+
+def test_a_training_records_the_exact_command_and_what_was_installed(trained):
+    settings = trained / "causalgdp" / "Pendulum-v1_1" / "Pendulum-v1"
+    assert shlex.split((settings / "command.txt").read_text()) == sys.orig_argv
+    versions = yaml.safe_load((settings / "versions.yml").read_text())
+    assert versions["sb3_causalgdp"] == sb3_causalgdp.__version__
+    for name in ("rl_zoo3", "mujoco"):
+        assert versions[name] == (version(name) if importlib.util.find_spec(name) else "not installed")
 
 
 def test_playing_takes_no_memory_for_transitions(zoo, logs, capsys, monkeypatch):

@@ -5,7 +5,8 @@ from typing import NamedTuple
 import numpy as np
 import torch as th
 
-SMALL = 4096
+from sb3_causalgdp.causal.matrices import product
+
 TARGETS_AT_ONCE = 128  # so that the systems on the supports stay small in memory
 CHECK_EVERY = 20
 OVER_RELAXATION = 1.7
@@ -46,10 +47,9 @@ def solve_lasso_gram(
     :param tolerance: Largest relative KKT residual
     :return: the solution; one that did not converge is returned as it is
     """
-    limit = tolerance * np.abs(cross).max(axis=0)
     if sparsity == 0.0:
-        weights = least_squares_gram(gram, cross)
-        return LassoSolution(weights, 0, bool((np.abs(product(gram, weights) - cross).max(axis=0) <= limit).all()))
+        return LassoSolution(least_squares_gram(gram, cross), 0, True)
+    limit = tolerance * np.abs(cross).max(axis=0)
     weights = np.zeros_like(cross) if initial is None else np.array(initial, dtype=np.float64)
     iterations, converged = 0, True
     for first in range(0, cross.shape[1], TARGETS_AT_ONCE):
@@ -211,10 +211,3 @@ def newton_steps(gram: np.ndarray, support: np.ndarray, slopes: np.ndarray) -> n
             solved = np.linalg.solve(systems, slopes[inputs, targets] * used[:, :, None])
             steps[inputs, targets] = np.where(used[:, :, None], solved, steps[inputs, targets])
     return steps
-
-
-def product(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """
-    :return: the product of two matrices; by torch, which is faster than numpy, where they are not small
-    """
-    return one @ other if other.size < SMALL else (th.from_numpy(one) @ th.from_numpy(other)).numpy()

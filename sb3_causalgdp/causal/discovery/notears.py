@@ -6,9 +6,10 @@ import numpy as np
 
 from sb3_causalgdp.causal.degenerate import Degeneracy, find_limits
 from sb3_causalgdp.causal.discovery.acyclic import notears, without_cycles
-from sb3_causalgdp.causal.discovery.lasso import least_squares_gram, newton_steps, product, solve_lasso_gram
+from sb3_causalgdp.causal.discovery.lasso import least_squares_gram, newton_steps, solve_lasso_gram
 from sb3_causalgdp.causal.graph import CausalGraph
 from sb3_causalgdp.causal.jackknife import jackknife_error
+from sb3_causalgdp.causal.matrices import product
 from sb3_causalgdp.causal.moments import Moments, StreamingMoments, merge_spread
 from sb3_causalgdp.causal.variables import TransitionVariables
 
@@ -34,7 +35,9 @@ def weight_masks(weights: np.ndarray, edge_threshold: float, mask_scale: float) 
     :return: masks in [0, 1), the same shape
     """
     squares = weights**2
-    return np.where(np.abs(weights) < edge_threshold, 0.0, squares / (squares + mask_scale**2))
+    masks = squares / (squares + mask_scale**2)
+    masks[np.abs(weights) < edge_threshold] = 0.0
+    return masks
 
 
 class Notears:
@@ -193,20 +196,23 @@ class Notears:
         free, targets = inputs[degeneracy.kept], targets[moves]
         chosen = np.ix_(moves, degeneracy.kept)
         units = problem.to_standardised(targets, free)
-        gram, cross = problem.second_moments(free, free), problem.second_moments(free, targets)
+        gram, cross = problem.second_moments(free, free), problem.second_moments(targets, free)
         start, errors = initial[chosen] / units, None
         if instantaneous:
             among = self._among(problem.second_moments(targets, targets), gram, cross)
             self.instantaneous_weights = np.zeros((len(initial), len(initial)))
             self.instantaneous_weights[np.ix_(moves, moves)] = among * problem.to_standardised(targets, targets)
             to_direct = np.eye(len(targets)) - among
-            total = np.linalg.solve(to_direct, self._lasso(gram, cross @ to_direct.T, to_direct @ start))
+            total = np.linalg.solve(to_direct, self._lasso(gram, to_direct @ cross, to_direct @ start))
         else:
             total = self._lasso(gram, cross, start)
-            errors = problem.jackknife(free, targets, gram, cross, total, self.sparsity)
+        # Second moments of what the inputs leave of the targets, and the inputs: none after least squares
+        left = np.zeros_like(cross) if self.sparsity == 0.0 else cross - product(total, gram)
+        if not instantaneous:
+            errors = problem.jackknife(free, targets, gram, left, total, self.sparsity)
         weights, r_squared = np.zeros_like(initial), np.zeros(len(initial))
         weights[chosen] = total * units
-        r_squared[moves] = problem.r_squared(targets, gram, cross, total)
+        r_squared[moves] = problem.r_squared(targets, cross, left, total)
         standard_errors = None
         if errors is not None:
             standard_errors = np.zeros_like(initial)
@@ -218,7 +224,8 @@ class Notears:
         return _Part(degeneracy.share(self.mask(weights)), weights, r_squared, standard_errors)
 
     def _lasso(self, gram: np.ndarray, cross: np.ndarray, initial: np.ndarray) -> np.ndarray:
-        solution = solve_lasso_gram(gram, cross, self.sparsity, initial.T, self.max_iterations, self.tolerance)
+        """Weights of shape (m, p) from second moments of the inputs, (p, p), and of these with the targets, (m, p)."""
+        solution = solve_lasso_gram(gram, cross.T, self.sparsity, initial.T, self.max_iterations, self.tolerance)
         if not solution.converged:
             warnings.warn(
                 f"NOTEARS stopped at max_iterations={self.max_iterations} before tolerance={self.tolerance:g}", stacklevel=4
@@ -227,7 +234,7 @@ class Notears:
 
     def _among(self, target_moments: np.ndarray, gram: np.ndarray, cross: np.ndarray) -> np.ndarray:
         """Weights among the targets, from the second moments of what the inputs leave of them, shape (m, m)."""
-        left = target_moments - cross.T @ least_squares_gram(gram, cross)
+        left = target_moments - cross @ least_squares_gram(gram, cross.T)
         return without_cycles(notears((left + left.T) / 2.0, self.sparsity), self.edge_threshold)
 
 
@@ -249,16 +256,18 @@ class _Standardised:
         moments = self.correlation[rows][:, columns]
         return moments if self.is_standard else moments * np.outer(self.scale[rows], self.scale[columns])
 
-    def to_standardised(self, targets: np.ndarray, inputs: np.ndarray) -> np.ndarray:
-        """Factors that bring weights into standardised units, shape (m, p)."""
-        return np.outer(1.0 / self.scale[targets], self.scale[inputs])
+    def to_standardised(self, targets: np.ndarray, inputs: np.ndarray) -> float | np.ndarray:
+        """Factors that bring weights into standardised units, shape (m, p); 1 where they are."""
+        return 1.0 if self.is_standard else np.outer(1.0 / self.scale[targets], self.scale[inputs])
 
-    def r_squared(self, targets: np.ndarray, gram: np.ndarray, cross: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    def r_squared(self, targets: np.ndarray, cross: np.ndarray, left: np.ndarray, weights: np.ndarray) -> np.ndarray:
         """
+        :param cross: Second moments of the targets and the inputs, shape (m, p)
+        :param left: Those of the residuals and the inputs, shape (m, p)
         :param weights: In the problem's units, shape (m, p)
         :return: 1 - residual variance / variance, shape (m,)
         """
-        explained = np.einsum("ij,ij->i", weights, 2.0 * cross.T - product(weights, gram))
+        explained = np.einsum("ij,ij->i", weights, cross) + np.einsum("ij,ij->i", weights, left)
         return np.clip(explained / self.scale[targets] ** 2, 0.0, 1.0)
 
     def jackknife(
@@ -266,20 +275,21 @@ class _Standardised:
         inputs: np.ndarray,
         targets: np.ndarray,
         gram: np.ndarray,
-        cross: np.ndarray,
+        left: np.ndarray,
         weights: np.ndarray,
         sparsity: float,
     ) -> np.ndarray | None:
         """
+        :param left: Second moments of the residuals and the inputs in all rows, shape (m, p)
         :param weights: Solution in the problem's units, shape (m, p)
         :param sparsity: Weight of the L1 norm
         :return: standard errors of the weights, shape (m, p); None when there are not two blocks
         """
         if len(self.blocks) < 2:
             return None
-        whole, gradients = product(weights, gram) - cross.T, []
+        gradients = []
         for block, share, deviation in zip(self.blocks, self.shares, self._deviations_without, strict=True):
-            gradients.append(share / (1.0 - share) * (whole - self._gradient(block, inputs, targets, weights)))
+            gradients.append(share / (1.0 - share) * (-left - self._gradient(block, inputs, targets, weights)))
             if self.is_standard:
                 # The weight of the L1 norm is in units of a correlation, of the other blocks'
                 gradients[-1] += sparsity * (np.outer(deviation[targets], deviation[inputs]) - 1.0) * np.sign(weights)

@@ -9,6 +9,7 @@ from sb3_causalgdp.causal.basis import BASES, BasisExpansion, BasisMoments
 from sb3_causalgdp.causal.degenerate import Degeneracy, find_limits
 from sb3_causalgdp.causal.graph import CausalGraph
 from sb3_causalgdp.causal.jackknife import jackknife_error
+from sb3_causalgdp.causal.matrices import cholesky_in_place
 from sb3_causalgdp.causal.moments import Moments, Spread, StreamingMoments, merge_spread
 from sb3_causalgdp.causal.variables import TransitionVariables
 
@@ -325,9 +326,8 @@ class _Regression:
         diagonal = np.einsum("ii->i", gram)
         diagonal[self.inverse_scale == 0.0] = 1.0
         diagonal += RIDGE
-        # In place, and by columns: LAPACK wants these, and another matrix of this size would be felt
-        by_columns = th.from_numpy(gram).T
-        return th.linalg.cholesky(by_columns, out=by_columns)
+        # Another matrix of this size would be felt
+        return cholesky_in_place(gram)
 
     def _fit(self, total: Moments, factor: th.Tensor) -> _Fit:
         cross = total.cross * self.inverse_scale[:, None] / (total.count * self.target_scale)
