@@ -198,6 +198,22 @@ class Planner:
         pass
 
 
+def study_arguments(task: str) -> dict[str, Any]:
+    """
+    :param task: Name of the task
+    :return: Arguments of CausalGDP that all its variants share
+    """
+    # Offline, the denoising term has weight 1; the learning rate is the paper's
+    return {
+        "policy_kwargs": {"net_arch": NET_ARCH},
+        "batch_size": BATCH_SIZE,
+        "gamma": DISCOUNT,
+        "learning_rate": 3e-4,
+        "eta": ETA[MAZE_TASKS[task][0]] if task in MAZE_TASKS else 1.0,
+        "denoising_weight": 1.0,
+    }
+
+
 def make_learner(method: str, task: str, seed: int, dataset_id: str, overrides: dict[str, Any] | None = None) -> Learner:
     """
     :param method: One of ``METHODS``
@@ -216,13 +232,4 @@ def make_learner(method: str, task: str, seed: int, dataset_id: str, overrides: 
         return D3rlpyLearner(dataset_id, seed, name, {**kwargs, **overrides})
     if method not in CAUSALGDP_METHODS:
         raise ValueError(f"method must be one of {', '.join(METHODS)}, got {method!r}")
-    # Offline, the denoising term has weight 1; the learning rate is the paper's
-    offline = {
-        "policy_kwargs": {"net_arch": NET_ARCH},
-        "batch_size": BATCH_SIZE,
-        "gamma": DISCOUNT,
-        "learning_rate": 3e-4,
-        "eta": ETA[MAZE_TASKS[task][0]],
-        "denoising_weight": 1.0,
-    }
-    return CausalGDPLearner(dataset_id, seed, {**offline, **CAUSALGDP_METHODS[method], **overrides})
+    return CausalGDPLearner(dataset_id, seed, {**study_arguments(task), **CAUSALGDP_METHODS[method], **overrides})
