@@ -47,6 +47,7 @@ SYSTEMS: dict[str, dict[str, Any]] = {kind: {"kind": kind} for kind in KINDS}
 SYSTEMS["confounded_0.05"] = {"kind": "confounded", "action_noise": 0.05}
 MIN_TIMED_SECONDS = 0.2  # a faster call is repeated, and its median counts
 SLOW_SECONDS = 10.0  # a slower call is timed once
+ALTERNATIONS = 30  # of refreshes after few and many rows
 SAME_PROBLEM = ("zheng_notears_allowed", "lasso")  # their weights should be those of notears
 HUMANOID: dict[str, tuple[str, dict[str, Any]]] = {
     "notears": ("notears", {}),
@@ -161,7 +162,7 @@ def graph_scores(estimate: Estimate, system: ControlSystem) -> Record:
     folded = system.fold_copies(estimate.ranking)
     ranking, masks, effects = (system.fold_copies(matrix)[where] for matrix in estimate[:3])
     n_states = len(where) - 1
-    blocks = {
+    blocks: dict[str, Any] = {
         "state": np.s_[:n_states, :n_states],
         "action": np.s_[:n_states, n_states:],
         "reward": np.s_[n_states:],
@@ -273,36 +274,48 @@ def run_speed(args: argparse.Namespace, fits: dict[str, Fit]) -> None:
 
 
 def run_scaling(args: argparse.Namespace, fits: dict[str, Fit]) -> None:
-    """Ours on a nonlinear system of HalfCheetah's size: seconds per million rows to gather, and of a refresh."""
+    """Ours on a nonlinear system of HalfCheetah's size: seconds to gather so many rows, and of a refresh after them."""
     results = Results(args.folder, "scaling", ("rows", "repeat", "method"), args.resume)
     system = make_system("nonlinear", np.random.default_rng(0), n_states=17, n_actions=6)
     ours = [name for name in fits if name in DISCOVERY_METHODS]
-    for n_rows in args.rows or (20_000, 1_000_000):
-        calls = {name: partial(_gather_and_refresh, system, n_rows, name, args.kwargs.get(name, {})) for name in ours}
-        for repeat, name in interleaved(ours, args.repeats):
+    counts = args.rows or (20_000, 1_000_000)
+    for repeat, name in interleaved(ours, args.repeats):
+        if results.find(repeat=repeat, method=name):
+            continue
+        call = partial(_gather_and_refresh, system, counts, name, args.kwargs.get(name, {}))
+        outcome = run_limited(call, args.time_limit)
+        for n_rows in counts:
             key = {"rows": n_rows, "repeat": repeat, "method": name}
-            if results.find(**key) or results.find(method=name, rows=n_rows, status="> limit"):
-                continue
-            outcome = run_limited(calls[name], args.time_limit)
-            results.add(key | timed(outcome) | (outcome.value or {}))
+            results.add(key | timed(outcome) | (outcome.value or {}).get(n_rows, {}))
     columns = ("gather_seconds", "refresh_seconds", "peak_mib")
     results.write_table(("method", "rows"), columns, median_or_nan)
 
 
-def _gather_and_refresh(system: ControlSystem, n_rows: int, name: str, kwargs: dict[str, Any]) -> Record:
-    """CPU seconds of the statistics' updates, by 10,000 rows (made beforehand, not timed), and of one refresh."""
+def _gather_and_refresh(system: ControlSystem, counts: Iterable[int], name: str, kwargs: dict[str, Any]) -> dict[int, Record]:
+    """
+    By the number of rows: CPU seconds of the statistics' updates, by 10,000 rows (made beforehand, not timed), and of a
+    refresh; refreshes after few and many rows alternate.
+    """
     rng = np.random.default_rng(0)
     variables = system.variables
     block = 10_000
-    statistics = gather(name, system.sample(min(block, n_rows), rng), variables, **kwargs)
-    gathering = 0.0
-    for _ in range(n_rows // block - 1):
-        rows = system.sample(block, rng)
-        start = time.thread_time()
-        statistics.update(rows)
-        gathering += time.thread_time() - start
-    seconds = seconds_per_call(partial(refresh, name, statistics, variables, **kwargs), MIN_TIMED_SECONDS)[0]
-    return {"gather_seconds": gathering, "refresh_seconds": seconds}
+    records: dict[int, Record] = {}
+    calls: dict[int, Callable[[], Any]] = {}
+    for n_rows in counts:
+        statistics = gather(name, system.sample(min(block, n_rows), rng), variables, **kwargs)
+        gathering = 0.0
+        for _ in range(n_rows // block - 1):
+            rows = system.sample(block, rng)
+            start = time.thread_time()
+            statistics.update(rows)
+            gathering += time.thread_time() - start
+        records[n_rows] = {"gather_seconds": gathering}
+        calls[n_rows] = partial(refresh, name, statistics, variables, **kwargs)
+    seconds: dict[int, list[float]] = {n_rows: [] for n_rows in calls}
+    for _ in range(ALTERNATIONS):
+        for n_rows, call in calls.items():
+            seconds[n_rows].append(seconds_per_call(call)[0])
+    return {n_rows: record | {"refresh_seconds": float(np.median(seconds[n_rows]))} for n_rows, record in records.items()}
 
 
 def run_humanoid(args: argparse.Namespace, fits: dict[str, Fit]) -> None:

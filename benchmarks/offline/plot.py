@@ -25,6 +25,7 @@ LABELS = {
     "no_guidance": "no guidance",
     "bc": "diffusion behaviour cloning",
     "td3_bc": "TD3+BC",
+    "td3_bc_200": "TD3+BC, alpha 200",
     "iql": "IQL",
     "cql": "CQL",
     "planner": "planner, knows the maze",

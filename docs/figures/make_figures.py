@@ -360,7 +360,7 @@ def draw_counterfactual() -> Figure:
         axes.set_xlabel("step", fontsize=9)
         axes.set_ylabel(label, fontsize=9)
         axes.spines[["top", "right"]].set_visible(False)
-    figure.axes[0].legend(fontsize=8, frameon=False)
+    figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=3, fontsize=8, frameon=False)
     return figure
 
 

@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
+from sb3_causalgdp.causal.degenerate import CONFOUNDED_VIF
 from sb3_causalgdp.causal.discovery import DISCOVERY_METHODS, make_discovery, make_statistics
-from sb3_causalgdp.causal.discovery.partial_r2 import CONFOUNDED_VIF
 from sb3_causalgdp.causal.graph import CausalGraph
 from sb3_causalgdp.causal.sources import BATCH_ROWS, TransitionSource, open_source
 

@@ -40,6 +40,12 @@ class BasisExpansion:
         self._first, self._second = (first, second) if self.products else (first[:0], second[:0])
         self.n_features = number_of_features(n_inputs, self.basis)
 
+    @property
+    def squares_and_products(self) -> np.ndarray:
+        """Which features are of second order, boolean, shape (n_features,)."""
+        n_inputs, feature = len(self.location), np.arange(self.n_features)
+        return ((feature >= n_inputs) & (feature < 2 * n_inputs)) | (feature >= self.n_functions * n_inputs)
+
     def standardise(self, inputs: np.ndarray) -> np.ndarray:
         """
         :param inputs: shape (N, p)

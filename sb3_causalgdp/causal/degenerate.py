@@ -1,5 +1,6 @@
 """What no data can tell apart: variables that never move, and variables that are linear functions of each other."""
 
+import warnings
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from typing import Any
@@ -14,6 +15,7 @@ DEPENDENT_SHARE = 1e-8  # of a variable's variance left by the others; rounding 
 SUSPICIOUS_SHARE = 1e-2  # of a variable's variance left by those before it: of more, it is independent of these
 RIDGE = 1e-8  # takes the factorisation past dependent variables
 SMALLEST_COEFFICIENT = 1e-3
+CONFOUNDED_VIF = 40.0
 
 
 @dataclass(frozen=True)
@@ -188,3 +190,44 @@ def find_limits(correlation: np.ndarray, variables: TransitionVariables) -> Limi
         constant_variables=tuple(names[i] for i in constant),
         duplicated_variables=tuple(tuple(names[columns[i]] for i in sorted(group)) for columns, group in listed),
     )
+
+
+class LimitsFinder:
+    """
+    Finds what the data cannot say at each refresh of a method, and speaks of it.
+
+    The first time that the states and the other actions almost determine an action (variance inflation over 40), there is a
+    warning.
+
+    :param on_degenerate: ``"share"`` leaves it to the masks; ``"raise"`` is an error on constant or linearly dependent causes
+    """
+
+    def __init__(self, on_degenerate: str = "share") -> None:
+        if on_degenerate not in ("share", "raise"):
+            raise ValueError(f"on_degenerate must be 'share' or 'raise', got {on_degenerate!r}")
+        self.on_degenerate = on_degenerate
+        self._said_confounded = False
+
+    def __call__(self, correlation: np.ndarray, variables: TransitionVariables) -> Limits:
+        """
+        :param correlation: Correlation matrix of all variables, its diagonal 0 for those that do not move; never changed
+        :param variables: Names and order of the variables
+        :return: what the data cannot say
+        :raises ValueError: on constant or linearly dependent causes if ``on_degenerate="raise"``, naming both
+        """
+        limits = find_limits(correlation, variables)
+        constant = {*variables.state_names, *variables.action_names}.intersection(limits.constant_variables)
+        if self.on_degenerate == "raise" and (constant or limits.duplicated_variables):
+            dependent = [list(group) for group in limits.duplicated_variables]
+            raise ValueError(f"causes cannot be told apart: constant {sorted(constant)}, linearly dependent {dependent}")
+        over = np.flatnonzero(limits.action_vif > CONFOUNDED_VIF)
+        if len(over) > 0 and not self._said_confounded:
+            self._said_confounded = True
+            named = ", ".join(f"{variables.action_names[i]} ({limits.action_vif[i]:.3g})" for i in over)
+            warnings.warn(
+                "The states and the other actions almost determine these actions (variance inflation over "
+                f"{CONFOUNDED_VIF:g}): {named}. Their effects cannot be told from the others'; more exploration noise in the "
+                "data would help.",
+                stacklevel=3,
+            )
+        return limits

@@ -131,6 +131,23 @@ def merge_spread(parts: Sequence[Spread]) -> Spread:
     return _between(parts)[0]
 
 
+def leave_one_out(parts: Sequence[Spread]) -> list[Spread]:
+    """
+    :param parts: Of disjoint sets of rows, at least two; never changed
+    :return: for each part, the spread of the rows of all others
+    """
+    counts, means, squares = (np.stack([getattr(part, name) for part in parts]) for name in ("count", "mean", "squares"))
+    others = 1.0 - np.eye(len(parts))
+    weights = others * counts
+    totals = weights.sum(axis=1)
+    # From the mean of one of the others: what is constant in all of them then has exactly no variance
+    origins = means[[1] + [0] * (len(parts) - 1)]
+    shifts = means - origins[:, None]
+    shift = np.einsum("ij,ijk->ik", weights, shifts) / totals[:, None]
+    squares = others @ squares + np.einsum("ij,ijk->ik", weights, (shifts - shift[:, None]) ** 2)
+    return [Spread(float(total), *arrays) for total, *arrays in zip(totals, origins + shift, squares, strict=True)]
+
+
 def _between(parts: Sequence[Spread]) -> tuple[Spread, np.ndarray]:
     """The spread of all, and the deviations of the parts' means, weighted so that their products are those of the rows."""
     counts = np.array([part.count for part in parts])

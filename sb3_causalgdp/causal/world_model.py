@@ -154,9 +154,7 @@ class MaskedWorldModel(nn.Module):
         super().__init__()
         net_arch = [128, 128] if net_arch is None else list(net_arch)
         if not net_arch or len(set(net_arch)) > 1 or min(net_arch) < 1:
-            raise ValueError(
-                f"world_model_net_arch must be a list of equal positive sizes, like [128, 128], got {net_arch}"
-            )
+            raise ValueError(f"world_model_net_arch must be a list of equal positive sizes, like [128, 128], got {net_arch}")
         self.state_dim = state_dim
         self.action_dim = action_dim
         width, depth = net_arch[0], len(net_arch)

@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 from benchmarks.offline.data import ensure_dataset, transitions
-from benchmarks.offline.methods import CAUSALGDP_METHODS, METHODS, CausalGDPLearner, Planner, make_learner
+from benchmarks.offline.methods import CAUSALGDP_METHODS, D3RLPY_METHODS, METHODS, CausalGDPLearner, Planner, make_learner
 from benchmarks.offline.run import main
 from benchmarks.offline.study import SELECTION_SEED, TEST_SEED, Evaluation, train
 from sb3_causalgdp.offline.scores import normalized_score
@@ -165,4 +165,4 @@ def test_the_command_line_says_what_is_wrong(arguments, message, monkeypatch, ca
 
 
 def test_methods_are_those_of_the_command_line():
-    assert len(set(METHODS)) == len(METHODS) == len(CAUSALGDP_METHODS) + 4
+    assert len(set(METHODS)) == len(METHODS) == len(CAUSALGDP_METHODS) + len(D3RLPY_METHODS) + 1

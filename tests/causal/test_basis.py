@@ -50,6 +50,12 @@ def test_features_follow_the_formula(expansion):
     assert np.abs(z).max() > 5.0 and features.shape == (50, expansion.n_features)
 
 
+def test_squares_and_products_are_what_doubled_inputs_make_four_times_as_large(expansion):
+    z = np.random.default_rng(0).uniform(0.5, 2.0, (20, 3))
+    fourfold = np.isclose(expansion.features(2.0 * z), 4.0 * expansion.features(z)).all(axis=0)
+    np.testing.assert_array_equal(expansion.squares_and_products, fourfold)
+
+
 def test_features_of_a_variable_are_those_that_change_with_it(expansion):
     z = np.random.default_rng(0).standard_normal((20, 3))
     for variable, of_variable in enumerate(expansion.features_of(np.arange(3))):

@@ -293,7 +293,7 @@ def test_summary_of_variables_that_cannot_be_told_apart(tmp_path, capsys):
     assert "obs[0] = obs[2]" in printed.out
     assert "constant, without edges: obs[3], obs[3]'" in printed.out
     assert "(the lowest 8 of 11)" in printed.out
-    assert printed.err.startswith("warning: The states almost determine the actions")
+    assert printed.err.startswith("warning: The states and the other actions almost determine these actions")
     assert printed.err.count("\n") == 1
 
 

@@ -1,7 +1,9 @@
+import warnings
+
 import numpy as np
 import pytest
 
-from sb3_causalgdp.causal import CausalGraph, TransitionVariables, discover, make_discovery, min_rows
+from sb3_causalgdp.causal import CausalGraph, TransitionVariables, discover, make_discovery, make_statistics, min_rows
 
 VARIABLES = TransitionVariables(("x", "y", "z"), ("push", "pull"))
 METHODS = {
@@ -42,3 +44,45 @@ def test_a_graph_says_when_it_was_found_and_what_the_data_cannot_say(name):
     assert graph.duplicated_variables == (("x", "y"),)
     np.testing.assert_array_equal(graph.masks[:, 0][:3], graph.masks[:, 1][:3])
     assert graph.action_vif.shape == (2,) and graph.action_vif[1] == 1.0
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_causes_that_cannot_be_told_apart_are_an_error_if_asked_for(name):
+    kwargs, _ = METHODS[name]
+    if name == "direct_lingam":
+        pytest.importorskip("lingam")
+    rows = np.random.default_rng(0).standard_normal((200, VARIABLES.n_variables))
+    discover(name, rows, VARIABLES, **kwargs, on_degenerate="raise")
+    rows[:, 1] = -2.0 * rows[:, 0]
+    rows[:, 4] = 1.0
+    with pytest.raises(ValueError, match=r"constant \['pull'\], linearly dependent \[\['x', 'y'\]\]"):
+        discover(name, rows, VARIABLES, **kwargs, on_degenerate="raise")
+    with pytest.raises(ValueError, match="on_degenerate must be 'share' or 'raise', got 'ignore'"):
+        make_discovery(name, **kwargs, on_degenerate="ignore")
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_an_action_that_the_states_determine_is_warned_of_once(name):
+    kwargs, _ = METHODS[name]
+    if name == "direct_lingam":
+        pytest.importorskip("lingam")
+    rows = np.random.default_rng(0).standard_normal((200, VARIABLES.n_variables))
+    rows[:, 3] = rows[:, 0] - 0.5 * rows[:, 1] + 0.05 * rows[:, 3]
+    method = make_discovery(name, **kwargs)
+    statistics = make_statistics(method, VARIABLES)
+    statistics.update(rows)
+    with pytest.warns(UserWarning, match=r"almost determine these actions \(variance inflation over 40\): push \(\d"):
+        method(statistics, VARIABLES)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert method(statistics, VARIABLES).action_vif[0] > 40.0
+
+
+@pytest.mark.parametrize("name", ["notears", "partial_r2"])
+def test_rows_that_are_forgotten_do_not_count(name):
+    method = make_discovery(name)
+    statistics = make_statistics(method, VARIABLES, half_life=3.0)
+    for row in np.random.default_rng(0).standard_normal((100, 1, VARIABLES.n_variables)):
+        statistics.update(row)
+    with pytest.raises(ValueError, match=r"at least \d+ rows .* that are not forgotten, got 5"):
+        method(statistics, VARIABLES)

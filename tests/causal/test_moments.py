@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sb3_causalgdp.causal import StreamingMoments, TransitionVariables
-from sb3_causalgdp.causal.moments import merge, merge_spread
+from sb3_causalgdp.causal.moments import leave_one_out, merge, merge_spread
 
 
 def moments_of(rows, batch=64, **kwargs):
@@ -14,7 +14,7 @@ def moments_of(rows, batch=64, **kwargs):
     return moments
 
 
-def leave_one_out(moments):
+def without_each_block(moments):
     """Moments of all blocks but one, and the share of the weight that this one has."""
     blocks = moments.blocks
     return [(merge([*blocks[:i], *blocks[i + 1 :]]), block.count / moments.count) for i, block in enumerate(blocks)]
@@ -92,7 +92,7 @@ def test_half_life_with_blocks_weighs_rows_by_their_age(window):
 @pytest.mark.parametrize("n_blocks", [4, 8])
 def test_half_life_leaves_weight_in_several_blocks(n_blocks):
     moments = moments_of(np.random.default_rng(0).normal(size=(20_000, 2)), batch=100, half_life=500, n_blocks=n_blocks)
-    shares = [share for _, share in leave_one_out(moments)]
+    shares = [share for _, share in without_each_block(moments)]
     assert len(shares) == n_blocks
     np.testing.assert_allclose(sum(shares), 1.0)
     assert max(shares) < 0.8
@@ -104,18 +104,24 @@ def test_rows_of_no_weight_are_gone():
     rows = np.random.default_rng(1).normal(size=(5000, 2))
     moments.update(rows)
     assert_of_rows(moments, rows)
-    assert all(0.0 < share < 1.0 for _, share in leave_one_out(moments))
+    assert all(0.0 < share < 1.0 for _, share in without_each_block(moments))
 
 
 def test_leaving_a_block_out_equals_numpy_on_the_other_rows():
     rows = np.random.default_rng(0).normal(size=(150, 3)) + np.linspace(0.0, 5.0, 150)[:, None]
-    parts = leave_one_out(moments_of(rows, batch=11, n_blocks=4))
+    moments = moments_of(rows, batch=11, n_blocks=4)
+    parts = without_each_block(moments)
     first_rows = [0, 64, 128, 150]  # two blocks of 8 rows, doubled three times, and one that is not full
     assert len(parts) == 3
     for i, (rest, share) in enumerate(parts):
         block = np.arange(first_rows[i], first_rows[i + 1])
         assert_of_rows(rest, np.delete(rows, block, axis=0))
         assert share == pytest.approx(len(block) / 150)
+        others = leave_one_out(moments.blocks)[i]
+        left = np.delete(rows, block, axis=0)
+        assert others.count == len(left)
+        np.testing.assert_allclose(others.mean, left.mean(axis=0), rtol=1e-12)
+        np.testing.assert_allclose(others.standard_deviation(), left.std(axis=0), rtol=1e-12)
 
 
 def test_there_is_a_block_for_the_first_rows_and_none_without():
@@ -128,10 +134,12 @@ def test_a_block_with_all_of_a_variance_leaves_none_behind():
     rows = np.random.default_rng(0).normal(size=(512, 2))
     rows[:, 1] = 0.1
     rows[70:80, 1] = 1e6
-    parts = leave_one_out(moments_of(rows, n_blocks=8))
-    left = [rest.covariance()[1, 1] for rest, _ in parts]
+    moments = moments_of(rows, n_blocks=8)
+    left = [rest.covariance()[1, 1] for rest, _ in without_each_block(moments)]
     assert left[1] == 0.0 and min(left[:1] + left[2:]) > 0.0
-    assert [rest.standard_deviation()[1] ** 2 for rest, _ in parts] == pytest.approx(left)
+    spreads = leave_one_out(moments.blocks)
+    assert [rest.standard_deviation()[1] ** 2 for rest in spreads] == pytest.approx(left)
+    assert [bool(rest.constant[1]) for rest in spreads] == [i == 1 for i in range(8)]
 
 
 @pytest.mark.parametrize("kwargs", [{}, {"half_life": 200.0}, {"window": 400, "n_blocks": 4}, {"n_blocks": 8}])
@@ -176,7 +184,7 @@ def test_blocks_stay_accurate_with_a_large_mean_and_a_small_deviation(batch):
     rows = 1e6 + 1e-3 * np.random.default_rng(0).normal(size=(3000, 2))
     moments = moments_of(rows, batch, n_blocks=8)
     everything = [(moments, rows)]
-    for i, (rest, _) in enumerate(leave_one_out(moments)):
+    for i, (rest, _) in enumerate(without_each_block(moments)):
         everything.append((rest, np.delete(rows, np.arange(512 * i, min(512 * (i + 1), 3000)), axis=0)))
     assert len(everything) == 7
     for estimate, kept in everything:

@@ -2,6 +2,7 @@ import sys
 import warnings
 from pathlib import Path
 
+import gymnasium as gym
 import numpy as np
 import pytest
 
@@ -134,6 +135,22 @@ def test_an_effect_is_the_mean_change_of_the_fitted_function():
         change = (expansion.features(above) - expansion.features(below)) @ coefficients / rows[:, 5:8].std(axis=0)
         expected = np.sign(change.mean(axis=0)) * np.abs(change).mean(axis=0)
         np.testing.assert_allclose(graph.effects[:3, i], expected, atol=5e-4)
+
+
+def test_the_cosine_of_an_angle_causes_the_next_cosine_although_its_square_is_known_from_the_sine():
+    """cos^2 + sin^2 = 1 in all rows: a function of the cosine could as well be one of squares of both."""
+    env, rows = gym.make("Pendulum-v1"), []
+    variables = TransitionVariables(("cos", "sin", "velocity"), ("torque",))
+    env.action_space.seed(0)
+    for seed in range(4):
+        state, _ = env.reset(seed=seed)
+        for _ in range(200):
+            action = env.action_space.sample()
+            next_state, reward, *_ = env.step(action)
+            rows.append([*state, *action, *next_state, reward])
+            state = next_state
+    graph = graph_of(np.array(rows), variables)
+    assert (graph.effects[[0, 1], [0, 1]] > 0.7).all() and (graph.masks[[0, 1], [0, 1]] > 0.99).all()
 
 
 def test_a_cause_in_a_product_alone_is_found():
@@ -430,14 +447,6 @@ def test_a_constant_reward_has_no_causes():
     assert not graph.masks[3].any() and graph.r_squared[3] == 0.0 and graph.masks[0, 0] > 0.99
 
 
-def test_degenerate_causes_are_an_error_if_asked_for():
-    rows = with_copy()
-    rows[:, 4] = 0.5
-    with pytest.raises(ValueError, match=r"constant \['pull'\], linearly dependent \[\['x', 'z'\]\]"):
-        graph_of(rows, on_degenerate="raise")
-    assert graph_of(rows_of(2000), on_degenerate="raise").duplicated_variables == ()
-
-
 @pytest.mark.parametrize("where", [slice(0, 60), slice(700, 760)])
 def test_a_variable_that_moves_in_one_block_alone_does_no_harm(where):
     rows = rows_of(2000)
@@ -478,7 +487,7 @@ def confounded_rows():
 def test_actions_that_the_states_determine_are_warned_of_once():
     method = PartialR2()
     statistics = statistics_of(confounded_rows(), method)
-    with pytest.warns(UserWarning, match=r"almost determine the actions .*: push \(1.5e\+03|: push \(\d") as caught:
+    with pytest.warns(UserWarning, match=r"almost determine these actions .*: push \(1.5e\+03|: push \(\d") as caught:
         first = method(statistics, VARIABLES)
     assert len(caught) == 1 and caught[0].filename == __file__ and "pull" not in str(caught[0].message)
     with warnings.catch_warnings():
@@ -540,15 +549,6 @@ def test_too_few_rows_say_how_many_are_needed():
     with pytest.raises(ValueError, match=r"needs at least 14 rows .* got 0"):
         graph_of(rows_of(0))
     graph_of(rows_of(14))
-
-
-def test_rows_that_are_forgotten_do_not_count():
-    method = PartialR2()
-    statistics = make_statistics(method, VARIABLES, half_life=5.0)
-    for row in rows_of(400)[:, None]:
-        statistics.update(row)
-    with pytest.raises(ValueError, match="not forgotten, got 8"):
-        method(statistics, VARIABLES)
 
 
 def test_wrong_statistics_are_an_error():

@@ -3,10 +3,11 @@ from typing import Any
 
 import numpy as np
 
-from sb3_causalgdp.causal.degenerate import find_degeneracy, find_limits
+from sb3_causalgdp.causal.degenerate import LimitsFinder, find_degeneracy
 from sb3_causalgdp.causal.discovery.lasso import least_squares_gram
 from sb3_causalgdp.causal.discovery.notears import weight_masks
 from sb3_causalgdp.causal.graph import CausalGraph
+from sb3_causalgdp.causal.moments import StreamingMoments
 from sb3_causalgdp.causal.recent_rows import RecentRows, checked_rows
 from sb3_causalgdp.causal.variables import TransitionVariables
 
@@ -41,11 +42,18 @@ class DirectLingam:
     :param mask_scale: The \\|w\\| at which a mask is one half, positive
     :param window: Newest rows that are kept where the caller sets no window, at least 20
     :param max_states: Largest number of states that is accepted
+    :param on_degenerate: ``"share"`` lets linearly dependent causes share a mask and gives constant ones none, ``"raise"`` is
+        an error that names both
     :raises ImportError: when the package ``lingam`` is missing
     """
 
     def __init__(
-        self, edge_threshold: float = 0.02, mask_scale: float = 0.05, window: int = 5_000, max_states: int = 60
+        self,
+        edge_threshold: float = 0.02,
+        mask_scale: float = 0.05,
+        window: int = 5_000,
+        max_states: int = 60,
+        on_degenerate: str = "share",
     ) -> None:
         _lingam()
         for name, number, zero_allowed in (("edge_threshold", edge_threshold, True), ("mask_scale", mask_scale, False)):
@@ -58,6 +66,7 @@ class DirectLingam:
         self.mask_scale = mask_scale
         self.window = window
         self.max_states = max_states
+        self._find_limits = LimitsFinder(on_degenerate)
         self.instantaneous_weights: np.ndarray | None = None
         """Of the last graph: row j holds the direct weights of s'_k on s'_j in standardised units, without cycles, (n, n)."""
 
@@ -95,18 +104,19 @@ class DirectLingam:
         :param variables: Names and order of the variables
         :param previous: Not used
         :return: the graph; constant variables have no edges
-        :raises ValueError: on fewer than 2 n + d + 10 rows, or when the arguments are not about the same variables
+        :raises ValueError: on fewer than 2 n + d + 10 rows, when the arguments are not about the same variables, or on
+            linearly dependent or constant causes if ``on_degenerate="raise"``
         """
         n_states = variables.n_states
         rows = checked_rows(statistics, variables, "direct_lingam", self.min_rows(variables))
-        newest = RecentRows(variables)
+        newest = StreamingMoments(variables.n_variables)
         newest.update(rows)
-        moments = newest.moments.total()
+        moments = newest.total()
         moving = ~moments.constant
         rows = (rows - moments.mean) * moving / np.where(moving, moments.standard_deviation(), 1.0)
         inputs, after = variables.causes_of_state, variables.causes_of_reward
         targets = np.arange(variables.n_variables)[variables.next_state]
-        limits = find_limits(moments.correlation(), variables)
+        limits = self._find_limits(moments.correlation(), variables)
         of_now, of_after = limits.of_dynamics, limits.of_reward
         weights = np.zeros((n_states + 1, len(inputs)))
         weights[:n_states, of_now.kept] = self._dynamics(rows, inputs[of_now.kept], targets, moving[targets])

@@ -4,13 +4,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sb3_causalgdp.causal.degenerate import Degeneracy, find_limits
+from sb3_causalgdp.causal.degenerate import Degeneracy, LimitsFinder
 from sb3_causalgdp.causal.discovery.acyclic import notears, without_cycles
 from sb3_causalgdp.causal.discovery.lasso import least_squares_gram, newton_steps, solve_lasso_gram
 from sb3_causalgdp.causal.graph import CausalGraph
 from sb3_causalgdp.causal.jackknife import jackknife_error
 from sb3_causalgdp.causal.matrices import product
-from sb3_causalgdp.causal.moments import Moments, StreamingMoments, merge_spread
+from sb3_causalgdp.causal.moments import Moments, StreamingMoments, leave_one_out
 from sb3_causalgdp.causal.variables import TransitionVariables
 
 TINY = np.finfo(np.float64).tiny
@@ -72,6 +72,8 @@ class Notears:
     :param instantaneous: Whether edges inside s_{t+1} are estimated; costs hundreds of matrix exponentials of size n
     :param standard_errors: Whether rows are kept in eight blocks, for standard errors, which doubles the time of a graph; not
         with ``instantaneous``. With a window there are blocks, and so standard errors, in any case
+    :param on_degenerate: ``"share"`` lets linearly dependent causes share a mask and gives constant ones none, ``"raise"`` is
+        an error that names both
     """
 
     def __init__(
@@ -84,6 +86,7 @@ class Notears:
         standardize: bool = True,
         instantaneous: bool = False,
         standard_errors: bool = False,
+        on_degenerate: str = "share",
     ) -> None:
         for name, number, zero_allowed in (
             ("sparsity", sparsity, True),
@@ -104,6 +107,7 @@ class Notears:
         self.standardize = standardize
         self.instantaneous = instantaneous
         self.standard_errors = standard_errors
+        self._find_limits = LimitsFinder(on_degenerate)
         self.instantaneous_weights: np.ndarray | None = None
         """Of the last graph: row j holds the direct weights of s'_k on s'_j in standardised units, without cycles, (n, n)."""
 
@@ -129,13 +133,14 @@ class Notears:
         :param variables: Names and order of the variables
         :param previous: Graph over the same variables whose weights are the solver's start
         :return: the graph; constant variables have no edges
-        :raises ValueError: on fewer than n + d + 2 rows, or when the arguments are not about the same variables
+        :raises ValueError: on fewer than n + d + 2 rows that are not forgotten, when the arguments are not about the same
+            variables, or on linearly dependent or constant causes if ``on_degenerate="raise"``
         """
         self._check(moments, variables, previous)
         shape = (variables.n_states + 1, variables.n_states + variables.n_actions)
         start = np.zeros(shape) if previous is None else previous.effects
         problem = _Standardised(moments, self.standardize)
-        limits = find_limits(problem.correlation, variables)
+        limits = self._find_limits(problem.correlation, variables)
         now, after, reward = variables.causes_of_state, variables.causes_of_reward, np.array([variables.reward])
         parts = (
             self._solve(problem, now, after[: variables.n_states], limits.of_dynamics, start[:-1], self.instantaneous),
@@ -156,7 +161,7 @@ class Notears:
     def min_rows(self, variables: TransitionVariables) -> int:
         """
         :param variables: Names and order of the variables
-        :return: number of rows that a graph needs
+        :return: number of rows, not forgotten, that a graph needs
         """
         return variables.n_states + variables.n_actions + 2
 
@@ -171,8 +176,12 @@ class Notears:
         if moments.n_variables != variables.n_variables:
             raise ValueError(f"moments must hold {variables.n_variables} variables, got {moments.n_variables}")
         needed = self.min_rows(variables)
-        if moments.n_samples < needed:
-            raise ValueError(f"moments must hold at least {needed} rows (states + actions + 2), got {moments.n_samples}")
+        # Weights of a half-life do not add up to an integer
+        if moments.count < needed - 0.5:
+            raise ValueError(
+                f"moments must hold at least {needed} rows (states + actions + 2) that are not forgotten, "
+                f"got {moments.count:.0f}"
+            )
         if previous is not None and previous.variables != variables:
             raise ValueError(f"previous must be over {variables.names}, got {previous.variables.names}")
 
@@ -197,7 +206,9 @@ class Notears:
         chosen = np.ix_(moves, degeneracy.kept)
         units = problem.to_standardised(targets, free)
         gram, cross = problem.second_moments(free, free), problem.second_moments(targets, free)
-        start, errors = initial[chosen] / units, None
+        # Least squares needs no start
+        start = np.broadcast_to(0.0, cross.shape) if self.sparsity == 0.0 else initial[chosen] / units
+        errors = None
         if instantaneous:
             among = self._among(problem.second_moments(targets, targets), gram, cross)
             self.instantaneous_weights = np.zeros((len(initial), len(initial)))
@@ -242,8 +253,8 @@ class _Standardised:
     """Second moments in the units in which the problem is solved: all with deviation 1, or the variables' own."""
 
     def __init__(self, moments: StreamingMoments, standardize: bool) -> None:
-        total = moments.total()
         self.blocks = moments.blocks
+        total = self.blocks[0] if len(self.blocks) == 1 else moments.total()  # without a copy, which would be felt
         self.shares = np.array([block.count for block in self.blocks]) / total.count
         self.mean = total.mean
         self.moving = ~total.constant
@@ -302,8 +313,7 @@ class _Standardised:
     @cached_property
     def _deviations_without(self) -> list[np.ndarray]:
         """Standard deviations without each block, in those of all rows."""
-        others = [[*self.blocks[:i], *self.blocks[i + 1 :]] for i in range(len(self.blocks))]
-        return [merge_spread(blocks).standard_deviation() / self.deviation for blocks in others]
+        return [others.standard_deviation() / self.deviation for others in leave_one_out(self.blocks)]
 
     def _gradient(self, block: Moments, inputs: np.ndarray, targets: np.ndarray, weights: np.ndarray) -> np.ndarray:
         """Of half the mean square of the residuals in one block, shape (m, p)."""

@@ -1,4 +1,3 @@
-import warnings
 from collections.abc import Iterator
 from typing import NamedTuple
 
@@ -6,18 +5,19 @@ import numpy as np
 import torch as th
 
 from sb3_causalgdp.causal.basis import BASES, BasisExpansion, BasisMoments
-from sb3_causalgdp.causal.degenerate import Degeneracy, find_limits
+from sb3_causalgdp.causal.degenerate import Degeneracy, LimitsFinder
 from sb3_causalgdp.causal.graph import CausalGraph
 from sb3_causalgdp.causal.jackknife import jackknife_error
 from sb3_causalgdp.causal.matrices import cholesky_in_place
-from sb3_causalgdp.causal.moments import Moments, Spread, StreamingMoments, merge_spread
+from sb3_causalgdp.causal.moments import Moments, Spread, StreamingMoments, leave_one_out
 from sb3_causalgdp.causal.variables import TransitionVariables
 
 RIDGE = 1e-6  # of a feature's variance: features of many causes may be almost dependent where the causes are not
+# Larger, so that where cos^2 + sin^2 is 1 in all rows, what is linear in the cosine is not taken for squares
+RIDGE_OF_SQUARES_AND_PRODUCTS = 1e-5
 SMALLEST_RESIDUAL = 1e-9  # of the target's variance: what float32 rounding and the ridge leave of an exact function
 SMALLEST_DEVIATION = 1e-9  # in units of the standard deviation of all rows: below it, a column does not move in these rows
 FLOOR_SHARE = 1.0 / 30.0  # of the threshold: below it, the noise of the logarithm says nothing
-CONFOUNDED_VIF = 40.0
 THINNING = 8
 CHANGES_AT_ONCE = 2**18  # so that they stay in the processor's cache
 
@@ -57,6 +57,8 @@ class PartialR2:
     An effect is the difference of the target, in its standard deviations, when a cause moves from half a standard deviation
     below to half a one above, the others as they are: its size is the mean of the absolute difference over the newest 256
     rows, its sign that of the mean, so an even function has an effect too. R^2 is adjusted for the number of features as well.
+    Where several functions agree on all rows, as those of the cosine and the sine of an angle can, the one with the smallest
+    squares and products is taken.
 
     Linearly dependent variables are tested as a group and share its masks; variables that never move have no edges. Where rows
     are few, the products are left out, then sine and tanh, then the square, so that there are two rows for each feature.
@@ -67,8 +69,8 @@ class PartialR2:
         ``"products"``, with the products of pairs, too; ``"auto"``: these where states and actions are at most 60, else
         ``"additive"``
     :param max_memory: Bytes that the moments may take
-    :param on_degenerate: ``share`` lets linearly dependent causes share a mask and gives constant ones none, ``raise`` is an
-        error that names both
+    :param on_degenerate: ``"share"`` lets linearly dependent causes share a mask and gives constant ones none, ``"raise"`` is
+        an error that names both
     """
 
     def __init__(
@@ -85,14 +87,11 @@ class PartialR2:
             raise ValueError(f"spread must be a positive number, got {spread!r}")
         if basis not in BASES:
             raise ValueError(f"basis must be one of {BASES}, got {basis!r}")
-        if on_degenerate not in ("share", "raise"):
-            raise ValueError(f"on_degenerate must be 'share' or 'raise', got {on_degenerate!r}")
         self.threshold = threshold
         self.spread = spread
         self.basis = basis
         self.max_memory = max_memory
-        self.on_degenerate = on_degenerate
-        self._said_confounded = False
+        self._find_limits = LimitsFinder(on_degenerate)
 
     def make_statistics(
         self, variables: TransitionVariables, half_life: float | None = None, window: int | None = None
@@ -126,11 +125,7 @@ class PartialR2:
             variables, or on linearly dependent or constant causes if ``on_degenerate="raise"``
         """
         self._check(statistics, variables)
-        limits = find_limits(statistics.raw.correlation(), variables)
-        if self.on_degenerate == "raise":
-            causes = {*variables.state_names, *variables.action_names}
-            _refuse_degenerate(causes.intersection(limits.constant_variables), limits.duplicated_variables)
-        self._say_confounded(limits.action_vif, variables)
+        limits = self._find_limits(statistics.raw.correlation(), variables)
         rows = [
             self._estimate(_dynamics(statistics, limits.of_dynamics)),
             self._estimate(_reward(statistics, limits.of_reward)),
@@ -174,25 +169,6 @@ class PartialR2:
                 f"partial_r2 needs at least {needed} rows (2 (states + actions) + 4) that are not forgotten, got {n_rows:.0f}"
             )
 
-    def _say_confounded(self, inflation: np.ndarray, variables: TransitionVariables) -> None:
-        if self._said_confounded or inflation.max() <= CONFOUNDED_VIF:
-            return
-        self._said_confounded = True
-        over = np.flatnonzero(inflation > CONFOUNDED_VIF)
-        named = ", ".join(f"{variables.action_names[i]} ({inflation[i]:.3g})" for i in over)
-        warnings.warn(
-            f"The states almost determine the actions (variance inflation over {CONFOUNDED_VIF:g}): {named}. Their effects "
-            "cannot be told from those of the states; more exploration noise in the data would help.",
-            stacklevel=3,
-        )
-
-
-def _refuse_degenerate(constant: set[str], duplicated: tuple[tuple[str, ...], ...]) -> None:
-    if constant or duplicated:
-        raise ValueError(
-            f"causes cannot be told apart: constant {sorted(constant)}, linearly dependent {[list(g) for g in duplicated]}"
-        )
-
 
 class _Estimates(NamedTuple):
     """Of p possible causes and their m targets: partial R^2 and effects, each of shape (p, m)."""
@@ -206,11 +182,13 @@ class _Tests(NamedTuple):
     Leave-outs of as many features each: of a cause alone, or of linearly dependent ones together.
 
     :param causes: Index of one of the causes that each is about, shape (q,)
+    :param n_features: Number of features that are left out and in use, shape (q, 1)
     :param features: Indices of the features that are left out, shape (q, g)
     :param spread: Covariance of these features given all others, ``[(S^-1)_GG]^-1``, shape (q, g, g)
     """
 
     causes: np.ndarray
+    n_features: np.ndarray
     features: th.Tensor
     spread: th.Tensor
 
@@ -281,6 +259,7 @@ class _Regression:
         # A feature that is not used, or does not move, has nothing in common with any other
         moves = self.used & (feature_deviation > SMALLEST_DEVIATION)
         self.inverse_scale = moves / np.where(moves, feature_deviation, 1.0)
+        self.ridge = np.where(expansion.squares_and_products, RIDGE_OF_SQUARES_AND_PRODUCTS, RIDGE)
         spread = statistics.raw.spread()
         deviation = spread.standard_deviation()
         self.target_moves = ~spread.constant[targets]
@@ -288,6 +267,7 @@ class _Regression:
 
         factor = self._factor(total)
         self.fit = self._fit(total, factor)
+        self.raw_coefficients = self.fit.coefficients * th.from_numpy(self.inverse_scale)[:, None]
         inverse = th.cholesky_inverse(factor, out=factor)
         features_of_kept = expansion.features_of(degeneracy.kept)
         self.tests = self._tests(features_of_kept, inverse)
@@ -310,12 +290,17 @@ class _Regression:
         """
         if len(self.blocks) < 2:
             return
-        scores, squares = zip(*(self._scores(block) for block in self.blocks), strict=True)
+        scores, squares = th.empty(self.n_features, len(self.blocks), self.shape[1], dtype=th.float64), []
         for i, block in enumerate(self.blocks):
-            others = [j for j in range(len(self.blocks)) if j != i]
-            rest = merge_spread([self.blocks[j] for j in others])
-            residual = np.sum([squares[j] for j in others], axis=0) / rest.count
-            yield self._estimates(self._step(scores[i], residual, rest)), block.count / self.total.count
+            scores[:, i], of_block = self._scores(block)
+            squares.append(of_block)
+        scores *= th.from_numpy(self.inverse_scale)[:, None, None]
+        # One product for all blocks: each alone would read the whole inverse
+        steps = (self.inverse @ scores.flatten(1)).view_as(scores)
+        del scores
+        for i, (block, rest) in enumerate(zip(self.blocks, leave_one_out(self.blocks), strict=True)):
+            residual = np.sum(squares[:i] + squares[i + 1 :], axis=0) / rest.count
+            yield self._estimates(self._step(steps[:, i], residual, rest)), block.count / self.total.count
 
     def _factor(self, total: Moments) -> th.Tensor:
         """Cholesky factor of the features' second moments S, in units of their standard deviations; takes the place of
@@ -325,7 +310,7 @@ class _Regression:
         gram *= self.inverse_scale[:, None]
         diagonal = np.einsum("ii->i", gram)
         diagonal[self.inverse_scale == 0.0] = 1.0
-        diagonal += RIDGE
+        diagonal += self.ridge
         # Another matrix of this size would be felt
         return cholesky_in_place(gram)
 
@@ -335,7 +320,7 @@ class _Regression:
         cross[:, ~moves] = 0.0
         coefficients = th.cholesky_solve(th.from_numpy(cross), factor)
         # The ridge takes part of what is explained: b' (S + ridge) b = b' c
-        explained = np.einsum("ij,ij->j", coefficients.numpy(), cross + RIDGE * coefficients.numpy())
+        explained = np.einsum("ij,ij->j", coefficients.numpy(), cross + self.ridge[:, None] * coefficients.numpy())
         return _Fit(coefficients, deviation, variance, _residual(variance - explained, variance))
 
     def _units(self, spread: Spread) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -360,7 +345,7 @@ class _Regression:
             causes, indices = (np.array(part) for part in zip(*together, strict=True))
             features = th.from_numpy(indices)
             spread = th.linalg.inv(inverse[features[:, :, None], features[:, None, :]])
-            tests.append(_Tests(causes, features, spread))
+            tests.append(_Tests(causes, self.used[indices].sum(axis=1, keepdims=True), features, spread))
         return tests
 
     def _slopes(
@@ -377,23 +362,22 @@ class _Regression:
             # What changes with a cause is then a function of it alone: one of its ordered values can stand for its neighbours
             standardised = np.sort(standardised, axis=0)[THINNING // 2 - 1 :: THINNING]
         kept = self.degeneracy.kept
-        raw = self.fit.coefficients * th.from_numpy(self.inverse_scale)[:, None]
-        slopes = th.empty(*self.features_of_kept.shape, self.shape[1], dtype=raw.dtype)
+        slopes = th.empty(*self.features_of_kept.shape, self.shape[1], dtype=th.float64)
         differences = th.from_numpy(np.ascontiguousarray(expansion.differences(standardised, kept, half_steps)))
         n_causes = max(1, CHANGES_AT_ONCE // (len(standardised) * self.shape[1]))
         for first in range(0, len(kept), n_causes):
             chunk = slice(first, first + n_causes)
-            difference, of_cause = differences[chunk], raw[self.features_of_kept[chunk]]
+            difference, of_cause = differences[chunk], self.raw_coefficients[self.features_of_kept[chunk]]
             slopes[chunk] = difference.transpose(1, 2) @ th.sign(difference @ of_cause) / len(standardised)
         units = th.from_numpy(self.inverse_scale)[self.features_of_kept][:, :, None]
         return slopes * units, differences.mean(dim=1)[:, :, None] * units
 
     def _scores(self, block: Moments) -> tuple[th.Tensor, np.ndarray]:
         """
-        Of the rows of one block, in units of all rows: sums of the products of features and residuals, the gradient of least
-        squares, shape (F, m); and sums of the squared residuals, shape (m,).
+        Of the rows of one block: sums of the products of features and residuals, the gradient of least squares, shape (F, m);
+        and sums of the squared residuals, shape (m,). The targets are in units of all rows.
         """
-        raw = self.fit.coefficients * th.from_numpy(self.inverse_scale)[:, None]
+        raw = self.raw_coefficients
         cross = th.from_numpy(block.cross / self.target_scale)
         scores = th.addmm(cross, th.from_numpy(block.comoment), raw, alpha=-1.0)
         squares = block.squares[self.n_features :] / self.target_scale**2
@@ -402,14 +386,13 @@ class _Regression:
         shift = block.mean - self.total.mean
         residual = shift[self.n_features :] / self.target_scale - shift[: self.n_features] @ raw.numpy()
         scores += th.outer(th.from_numpy(block.count * shift[: self.n_features]), th.from_numpy(residual))
-        scores *= th.from_numpy(self.inverse_scale)[:, None]
         return scores, np.maximum(squares + block.count * residual**2, 0.0)
 
-    def _step(self, scores: th.Tensor, residual: np.ndarray, rest: Spread) -> _Fit:
+    def _step(self, step: th.Tensor, residual: np.ndarray, rest: Spread) -> _Fit:
         """
         The fit without some rows.
 
-        :param scores: Of the rows that are left out, shape (F, m)
+        :param step: Inverse of the features' second moments, times the scores of the rows that are left out, shape (F, m)
         :param residual: Mean square of the residuals of all others, shape (m,)
         :param rest: Of all others
         """
@@ -417,9 +400,11 @@ class _Regression:
         still = deviation <= SMALLEST_DEVIATION
         # Residuals are smaller than the errors, by the features that were fitted to them
         size = np.sqrt(self.total.count / self.freedom) / rest.count
-        coefficients = self.fit.coefficients - size * (self.inverse @ scores)
-        coefficients[still] = 0.0
-        coefficients[:, ~moves] = 0.0
+        coefficients = self.fit.coefficients - size * step
+        if still.any():
+            coefficients[still] = 0.0
+        if not moves.all():
+            coefficients[:, ~moves] = 0.0
         return _Fit(coefficients, deviation, variance, _residual(residual, variance))
 
     def _estimates(self, fit: _Fit) -> _Estimates:
@@ -427,12 +412,11 @@ class _Regression:
 
     def _partial_r2(self, fit: _Fit) -> np.ndarray:
         partial = np.zeros(self.shape)
-        for causes, features, spread in self.tests:
+        for causes, n_features, features, spread in self.tests:
             left_out = fit.coefficients[features]
             # Products of single numbers in a batch are slow
             explained = left_out * (spread @ left_out if features.shape[1] > 1 else spread * left_out)
             # Variances instead of sums of squares, as in the adjusted R^2, so that a null edge has 0 on average
-            n_features = self.used[features.numpy()].sum(axis=1)[:, None]
             without = _summed(explained).numpy() + fit.residual
             partial[causes] = np.maximum(1.0 - fit.residual * (1.0 + n_features / self.freedom) / without, 0.0)
         for group in self.degeneracy.groups:

@@ -4,7 +4,7 @@ from typing import NamedTuple
 import numpy as np
 import torch as th
 
-from sb3_causalgdp.causal.degenerate import find_limits
+from sb3_causalgdp.causal.degenerate import LimitsFinder
 from sb3_causalgdp.causal.discovery.partial_r2 import edge_probability
 from sb3_causalgdp.causal.graph import CausalGraph
 from sb3_causalgdp.causal.recent_rows import RecentRows, checked_rows
@@ -53,6 +53,8 @@ class WorldModelEffects:
     :param spread: Uncertainty of the mask in ln q, positive
     :param smallest_residual: Residual that a mask assumes at least, in units of the target's variance, positive
     :param seed: Of the weights, the batches and the held-out rows; torch's global generator is left as it is
+    :param on_degenerate: ``"share"`` lets linearly dependent causes share a mask and gives constant ones none, ``"raise"`` is
+        an error that names both
     """
 
     def __init__(
@@ -67,6 +69,7 @@ class WorldModelEffects:
         spread: float = 0.5,
         smallest_residual: float = 0.05,
         seed: int = 0,
+        on_degenerate: str = "share",
     ) -> None:
         for name, count, least in (
             ("gradient_steps", gradient_steps, 1),
@@ -94,6 +97,7 @@ class WorldModelEffects:
         self.spread = spread
         self.smallest_residual = smallest_residual
         self.seed = seed
+        self._find_limits = LimitsFinder(on_degenerate)
         self.world_model: MaskedWorldModel | None = None
         """The method's own model, with all masks 1; None before the first graph."""
         self._refreshes = 0
@@ -126,7 +130,8 @@ class WorldModelEffects:
         :param variables: Names and order of the variables
         :param previous: Not used: the model itself goes on
         :return: the graph; constant variables have no edges
-        :raises ValueError: on fewer than n + d + 10 rows, or when the arguments are not about the same variables
+        :raises ValueError: on fewer than n + d + 10 rows, when the arguments are not about the same variables, or on linearly
+            dependent or constant causes if ``on_degenerate="raise"``
         """
         rows = checked_rows(statistics, variables, "world_model", self.min_rows(variables))
         generator = th.Generator().manual_seed(self.seed + self._refreshes)
@@ -168,7 +173,7 @@ class WorldModelEffects:
         deviation = np.where(moments.constant, 0.0, moments.standard_deviation())
         differences = _differences(world_model, np.asarray(rows)[:MOST_TEST_ROWS], variables, deviation)
         n_states = variables.n_states
-        limits = find_limits(moments.correlation(), variables)
+        limits = self._find_limits(moments.correlation(), variables)
         probability = self._probability(differences)
         masks = [limits.of_dynamics.share(probability[:n_states]), limits.of_reward.share(probability[n_states:])]
         return CausalGraph(
