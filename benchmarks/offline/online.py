@@ -82,7 +82,7 @@ def fine_tune(
             done = until
             envs.seed(EVALUATION_SEED)
             returns, _ = evaluate_policy(model, envs, episodes, return_episode_rewards=True)
-            scores = np.array([normalized_score(task, [value]).mean for value in returns])
+            scores = np.array([normalized_score(task, [value]).mean for value in np.asarray(returns)])
             row = {"stage": stage, "count": done, "score": round(scores.mean(), 2), "std": round(scores.std(), 2)}
             rows.append({**row, "episodes": len(scores), "cpu_seconds": round(time.process_time() - start, 1)})
             print(json.dumps(rows[-1]), flush=True)

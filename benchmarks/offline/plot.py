@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pandas as pd
+from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -26,11 +27,13 @@ LABELS = {
     "bc": "diffusion behaviour cloning",
     "td3_bc": "TD3+BC",
     "td3_bc_200": "TD3+BC, alpha 200",
+    "td3_bc_published": "TD3+BC, published rates",
     "iql": "IQL",
+    "iql_published": "IQL, published rates",
     "cql": "CQL",
     "planner": "planner, knows the maze",
 }
-COLOURS = {method: f"C{index}" for index, method in enumerate(METHODS)} | {"planner": "black"}
+COLOURS = {method: colormaps["tab20"](index) for index, method in enumerate(METHODS)} | {"planner": "black"}
 
 
 def read(path: Path) -> pd.DataFrame:
