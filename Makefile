@@ -1,5 +1,6 @@
 SHELL=/bin/bash
 LINT_PATHS=sb3_causalgdp/ tests/ examples/ benchmarks/
+RUFF_PATHS=${LINT_PATHS} docs/ notebooks/
 
 pytest:
 	pytest -n 2 tests/
@@ -10,19 +11,19 @@ mypy:
 type: mypy
 
 lint:
-	ruff check ${LINT_PATHS}
+	ruff check ${RUFF_PATHS}
 
 format:
 	# Sort imports
-	ruff check --select I ${LINT_PATHS} --fix
+	ruff check --select I ${RUFF_PATHS} --fix
 	# Reformat
-	ruff format ${LINT_PATHS}
+	ruff format ${RUFF_PATHS}
 
 check-codestyle:
 	# Sort imports
-	ruff check --select I ${LINT_PATHS}
+	ruff check --select I ${RUFF_PATHS}
 	# Reformat
-	ruff format --check ${LINT_PATHS}
+	ruff format --check ${RUFF_PATHS}
 
 commit-checks: format type lint
 
@@ -30,6 +31,6 @@ doc:
 	sphinx-build -W --keep-going -n -q docs docs/_build/html
 
 clean:
-	rm -rf build/ dist/ *.egg-info .pytest_cache .mypy_cache .ruff_cache .coverage htmlcov
+	rm -rf build/ dist/ docs/_build/ *.egg-info .pytest_cache .mypy_cache .ruff_cache .coverage htmlcov
 
 .PHONY: pytest mypy type lint format check-codestyle commit-checks doc clean

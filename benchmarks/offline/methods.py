@@ -20,7 +20,7 @@ ACTOR_LEARNING_RATE = 3e-4
 CRITIC_LEARNING_RATE = 1e-3
 TARGET_UPDATE = 0.02
 # One action of a hundredth of a second changes the return by far less than its mean, by which the Q term is divided, and
-# than its standard deviation, in which the guidance counts: with the paper's eta of 3 and 5 and a scale of 1, the policy clones
+# than its standard deviation, in which the guidance counts: with the paper's eta of 3 and 5 and a scale of 1, it clones
 MAZE_ETA = 200.0
 MAZE_ARGUMENTS: dict[str, Any] = {
     "eta": MAZE_ETA,

@@ -37,8 +37,8 @@ DIVERGENCE_CALLBACK = "sb3_causalgdp.zoo.callbacks.StopOnDivergence"
 
 class CausalGDPExperimentManager(ExperimentManager):
     """
-    RL Zoo's manager. For other algorithms it is that one, except that what is wrong before the training is a ``SetupError``, and
-    that versions and the exact command are recorded.
+    RL Zoo's manager. For other algorithms it is that one, except that what is wrong before the training is a ``SetupError``,
+    and that versions and the exact command are recorded.
 
     Without ``config``, the hyperparameters of CausalGDP are those of our own file.
 

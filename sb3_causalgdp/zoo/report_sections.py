@@ -271,7 +271,9 @@ def _history_section(run: RunFolder, model: CausalGDP) -> Section:
             graphs = [*before, newest]
     if len(graphs) < 2:
         known = "one graph is known" if graphs else "no graph is known"
-        return Section(title, [f"There is none: {known}. The model at the end of a training holds them, and so do checkpoints."])
+        return Section(
+            title, [f"There is none: {known}. The model at the end of a training holds them, and so do checkpoints."]
+        )
     first, last = graphs[0], graphs[-1]
     caption = "Masks over the training, with the signs of the effects; number of edges, and how much the masks changed."
     return Section(

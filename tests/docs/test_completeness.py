@@ -60,6 +60,8 @@ def documented_names():
         text = page.read_text(encoding="utf-8")
         names.update(re.findall(r"^\.\. (?:auto\w+|py:\w+):: (\S+)$", text, re.MULTILINE))
         modules.update(re.findall(r"^\.\. automodule:: (\S+)\n    :members:\n", text + "\n", re.MULTILINE))
+        for members in re.findall(r"^\.\. automodule:: \S+\n    :members: (.+)$", text, re.MULTILINE):
+            names.update(members.split(", "))
     return names, modules
 
 
@@ -70,6 +72,22 @@ def test_every_public_name_is_in_the_api_reference(file):
     last_parts = {name.rpartition(".")[2] for name in names}
     missing = [name for name in public_names(file) if module not in modules and name not in last_parts]
     assert not [name for name in missing if name != "__version__"], f"docs/modules lacks these of {module}: {missing}"
+
+
+def test_every_name_that_a_page_imports_is_in_the_api_reference():
+    names, modules = documented_names()
+    last_parts = {name.rpartition(".")[2] for name in names}
+    pages = [DOCS.parent / "README.md", *DOCS.rglob("*.md")]
+    imports = [
+        (match[1], name.strip())
+        for page in pages
+        for match in re.finditer(
+            r"^from (sb3_causalgdp[\w.]*) import ([\w, ]+)$", page.read_text(encoding="utf-8"), re.MULTILINE
+        )
+        for name in match[2].split(",")
+    ]
+    assert len(imports) > 20
+    assert {(module, name) for module, name in imports if module not in modules and name not in last_parts} == set()
 
 
 # Arguments --------------------------------------------------------------------------------------------------------------

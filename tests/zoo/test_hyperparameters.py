@@ -9,6 +9,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import yaml
+from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.utils import LinearSchedule
 
 from sb3_causalgdp import CausalGDP
@@ -27,7 +28,7 @@ from sb3_causalgdp.zoo.hyperparameters import (
 )
 from sb3_causalgdp.zoo.offline_tasks import OFFLINE_TASKS, register_offline_tasks
 
-GUIDE = Path(__file__).parents[2] / "docs" / "guide" / "zoo.md"
+DOCS = Path(__file__).parents[2] / "docs"
 ENTRIES = yaml.safe_load(hyperparameter_file().read_text(encoding="utf-8"))
 # Not on this machine, or not with its MuJoCo
 NOT_HERE = ("LunarLander", "BipedalWalker", "CarRacing", "Fetch", "FrankaKitchen", "kitchen", "Pusher-v4")
@@ -180,12 +181,57 @@ def test_an_entry_trains(name, environments, monkeypatch, tmp_path):
     assert model._n_updates > 0
 
 
-EXAMPLES = re.findall(r"^```yaml\n(.*?)^```$", GUIDE.read_text(encoding="utf-8"), re.M | re.S) if GUIDE.is_file() else []
+EVERYTHING = """
+PointMaze_UMaze-v3:
+  n_timesteps: 6e1
+  policy: MultiInputPolicy
+  learning_starts: 25
+  batch_size: 4
+  learning_rate: lin_1e-3
+  critic_learning_rate: lin_2e-3
+  world_model_learning_rate: lin_3e-3
+  replay_buffer_class: HerReplayBuffer
+  replay_buffer_kwargs: {n_sampled_goal: 2}
+  normalize: {norm_obs: true, norm_reward: false}
+  policy_kwargs: {net_arch: [8], world_model_net_arch: [8]}
+  env_kwargs: {max_episode_steps: 20}
+  env_wrapper:
+    - gymnasium.wrappers.RescaleAction: {min_action: -0.5, max_action: 0.5}
+  callback:
+    - stable_baselines3.common.callbacks.StopTrainingOnMaxEpisodes: {max_episodes: 2}
+"""
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_what_an_entry_says_reaches_the_training(environments, monkeypatch, tmp_path):
+    (tmp_path / "entry.yml").write_text(EVERYTHING)
+    manager, model = build("PointMaze_UMaze-v3", monkeypatch, tmp_path, config="entry.yml", buffer_size=1_000)
+    manager.learn(model)
+    assert isinstance(model.replay_buffer, HerReplayBuffer) and model.replay_buffer.n_sampled_goal == 2
+    assert model.action_space.high.tolist() == [0.5, 0.5]
+    # Two episodes of 20 steps out of 60: a third of each rate is left
+    assert model.num_timesteps == 40
+    modules = (model.actor, model.critic, model.world_model)
+    rates = [module.optimizer.param_groups[0]["lr"] for module in modules]
+    assert rates == pytest.approx([1e-3 / 3, 2e-3 / 3, 3e-3 / 3], rel=0.1)
+    normalizer = model.get_vec_normalize_env()
+    assert normalizer.obs_rms["observation"].count > 40 and not normalizer.norm_reward
+
+
+EXAMPLES = [
+    example
+    for page in sorted(DOCS.rglob("*.md"))
+    for example in re.findall(r"^```yaml\n(.*?)^```$", page.read_text(encoding="utf-8"), re.M | re.S)
+]
+
+
+def test_the_documentation_has_examples():
+    assert len(EXAMPLES) >= 5
 
 
 @pytest.mark.parametrize("example", EXAMPLES)
 @pytest.mark.filterwarnings("ignore")
-def test_the_guides_examples_make_models(example, environments, monkeypatch, tmp_path):
+def test_an_example_of_the_documentation_makes_a_model(example, environments, monkeypatch, tmp_path):
     (tmp_path / "example.yml").write_text(example)
     (name,) = yaml.safe_load(example)
     _, model = build(name, monkeypatch, tmp_path, config="example.yml", buffer_size=1_000)

@@ -1,6 +1,9 @@
 """``train --optimize-hyperparameters``."""
 
 import math
+import os
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -64,6 +67,7 @@ def test_the_space_depends_on_the_entry():
         "guidance_target",
         "causal_refresh_freq",
         "causal_discovery",
+        "actor_update",
         "world_model",
     }
     assert wanted <= names["online"]
@@ -87,8 +91,7 @@ def test_a_search_is_stored_and_its_trials_are_trained_again(zoo, folder, capsys
     zoo("train", *PENDULUM, *STUDY, *search, "--seed", 3, "--no-optim-plots", "-conf", "entry.yml")
     assert "Number of finished trials:  2" in capsys.readouterr().out
     assert list((folder / "logs" / "causalgdp").glob("report_Pendulum-v1_2-trials-60-tpe-median_*.csv"))
-    backend = optuna.storages.journal.JournalFileBackend(str(folder / "logs" / "study.log"))
-    study = optuna.load_study(storage=optuna.storages.JournalStorage(backend), study_name="pendulum")
+    study = study_of(folder)
     assert [trial.state.name for trial in study.trials] == ["COMPLETE", "COMPLETE"]
     # The very first trial, too; the command line has the last word
     for trial_id in (0, 1):
@@ -99,6 +102,28 @@ def test_a_search_is_stored_and_its_trials_are_trained_again(zoo, folder, capsys
         wanted = convert_causalgdp_params(trial.params)
         assert model.eta == 0.125 and model.learning_rate == wanted["learning_rate"]
         assert model.policy_kwargs == {"activation_fn": "tanh", **wanted["policy_kwargs"]}
+
+
+def test_two_processes_at_once_share_a_search(folder):
+    search = ("--optimize", "--max-total-trials", "2", "--n-evaluations", "1", "--eval-episodes", "1", "--no-optim-plots")
+    tiny = ("learning_starts:20", "buffer_size:100", "env_kwargs:dict(max_episode_steps=10)")
+    command = [sys.executable, "-m", "sb3_causalgdp.zoo", "train", *PENDULUM, *STUDY, *search, "-uuid", "-n", "24"]
+    env = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), "OMP_NUM_THREADS": "1"}
+    (folder / "logs").mkdir()
+    processes = [
+        subprocess.Popen([*command, "-params", *tiny], env=env, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+        for _ in range(2)
+    ]
+    outputs = [process.communicate()[0] for process in processes]
+    assert [process.returncode for process in processes] == [0, 0], "\n".join(outputs)
+    trials = study_of(folder).trials
+    # A process may begin its last trial while the other one ends the search's last
+    assert 2 <= len(trials) <= 3 and {trial.state.name for trial in trials} == {"COMPLETE"}
+
+
+def study_of(folder):
+    backend = optuna.storages.journal.JournalFileBackend(str(folder / "logs" / "study.log"))
+    return optuna.load_study(storage=optuna.storages.JournalStorage(backend), study_name="pendulum")
 
 
 def test_processes_that_create_a_database_at_once_wait_for_each_other(folder, monkeypatch):
@@ -166,6 +191,5 @@ def test_a_trial_that_diverges_is_pruned_and_the_search_goes_on(with_error, zoo,
     with pytest.raises(SystemExit):
         zoo("train", *PENDULUM, *STUDY, *search, "-params", *tiny)
     assert "no trial was completed" in capsys.readouterr().err
-    backend = optuna.storages.journal.JournalFileBackend(str(folder / "logs" / "study.log"))
-    study = optuna.load_study(storage=optuna.storages.JournalStorage(backend), study_name="pendulum")
+    study = study_of(folder)
     assert [trial.state.name for trial in study.trials] == ["PRUNED", "PRUNED"]
