@@ -1,7 +1,10 @@
+import numpy as np
 import pandas as pd
 import pytest
 
 from benchmarks.offline.data import ensure_dataset
+from benchmarks.offline.guidance import Player, sweep
+from benchmarks.offline.methods import make_learner
 from benchmarks.offline.online import draw, fine_tune, hand_over
 from sb3_causalgdp import CausalGDP
 
@@ -33,3 +36,16 @@ def test_the_hand_over_is_read_off_the_last_offline_and_the_first_online_evaluat
     assert hand_over(table).splitlines()[2] == "| maze2d-umaze | causalgdp | 0 | 30.0 +- 4.0 | 28.0 +- 5.0 | 60.0 +- 2.0 |"
     draw(table, tmp_path / "curve.png")
     assert (tmp_path / "curve.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_checkpoint_is_played_with_another_guidance_than_it_was_trained_with(tmp_path, monkeypatch):
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    learner = make_learner("causalgdp", TASK, 0, ensure_dataset(TASK, STEPS), QUICK)
+    learner.train(3)
+    learner.save(tmp_path / "checkpoint-3")
+    observations = np.random.default_rng(0).normal(size=(20, 4)).astype(np.float32)
+    weak, strong = (Player(tmp_path / "checkpoint-3", outcome_guidance_scale=scale) for scale in (0.0, 1e6))
+    assert strong.model.policy.outcome_guidance_scale == 1e6
+    assert not np.allclose(weak.predict(observations), strong.predict(observations))
+    lines = sweep([tmp_path / "checkpoint-3"], TASK, [0.0, 30.0], [1, 2], episodes=1)
+    assert lines[0] == "| model | candidates | 0 | 30 |" and len(lines) == 4
