@@ -19,7 +19,7 @@ from sb3_causalgdp.offline.make import MAZE_TASKS
 from sb3_causalgdp.offline.scores import normalized_score
 
 
-class Player:
+class LoadedModel:
     """
     A trained model that acts with other settings than it was trained with.
 
@@ -53,7 +53,7 @@ def sweep(paths: list[Path], task: str, scales: list[float], candidates: list[in
     for path in paths:
         for n_candidates in candidates:
             settings = ({"outcome_guidance_scale": scale, "n_action_candidates": n_candidates} for scale in scales)
-            returns = [evaluation.returns(Player(path, **one)) for one in settings]
+            returns = [evaluation.returns(LoadedModel(path, **one)) for one in settings]
             scores = " | ".join(f"{normalized_score(task, values).mean:.0f}" for values in returns)
             lines.append(f"| {path.parent.name}, {path.name} | {n_candidates} | {scores} |")
             print(lines[-1], flush=True)

@@ -82,14 +82,18 @@ D3RLPY_METHODS: dict[str, tuple[str, dict[str, Any]]] = {
 METHODS = (*CAUSALGDP_METHODS, *D3RLPY_METHODS, "planner")
 
 
-class Learner(Protocol):
+class Player(Protocol):
+    """What an evaluation needs."""
+
+    def predict(self, observations: np.ndarray) -> np.ndarray:
+        """Actions in [-1, 1], shape ``(batch, d)``, for observations of shape ``(batch, n)``."""
+
+
+class Learner(Player, Protocol):
     """What the study needs of a method."""
 
     def train(self, n_updates: int) -> None:
         """Make gradient updates on the dataset."""
-
-    def predict(self, observations: np.ndarray) -> np.ndarray:
-        """Actions in [-1, 1], shape ``(batch, d)``, for observations of shape ``(batch, n)``."""
 
     def save(self, path: Path) -> None:
         """Write all that training goes on from."""

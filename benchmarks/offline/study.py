@@ -12,7 +12,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 import sb3_causalgdp.offline  # noqa: F401 (registers the environments)
 from benchmarks.offline.data import ensure_dataset, environment_id
-from benchmarks.offline.methods import Learner, make_learner
+from benchmarks.offline.methods import Learner, Player, make_learner
 from benchmarks.suite.jobs import write_atomically
 from sb3_causalgdp.offline.scores import normalized_score
 
@@ -35,7 +35,7 @@ class Evaluation:
         self.seed = seed
         self.envs = DummyVecEnv([lambda: gym.make(environment_id(task), disable_env_checker=True)] * episodes)
 
-    def returns(self, learner: Learner) -> np.ndarray:
+    def returns(self, learner: Player) -> np.ndarray:
         """
         :param learner: A trained method
         :return: Undiscounted return of each episode

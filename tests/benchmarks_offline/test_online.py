@@ -3,7 +3,7 @@ import pandas as pd
 import pytest
 
 from benchmarks.offline.data import ensure_dataset
-from benchmarks.offline.guidance import Player, sweep
+from benchmarks.offline.guidance import LoadedModel, sweep
 from benchmarks.offline.methods import make_learner
 from benchmarks.offline.online import draw, fine_tune, hand_over
 from sb3_causalgdp import CausalGDP
@@ -44,7 +44,7 @@ def test_a_checkpoint_is_played_with_another_guidance_than_it_was_trained_with(t
     learner.train(3)
     learner.save(tmp_path / "checkpoint-3")
     observations = np.random.default_rng(0).normal(size=(20, 4)).astype(np.float32)
-    weak, strong = (Player(tmp_path / "checkpoint-3", outcome_guidance_scale=scale) for scale in (0.0, 1e6))
+    weak, strong = (LoadedModel(tmp_path / "checkpoint-3", outcome_guidance_scale=scale) for scale in (0.0, 1e6))
     assert strong.model.policy.outcome_guidance_scale == 1e6
     assert not np.allclose(weak.predict(observations), strong.predict(observations))
     lines = sweep([tmp_path / "checkpoint-3"], TASK, [0.0, 30.0], [1, 2], episodes=1)
