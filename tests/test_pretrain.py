@@ -382,16 +382,16 @@ def test_training_starts_with_the_dataset_and_the_offline_stage(npz):
     assert model.offline_buffer is None and model._n_updates == 0
     model.learn(4)
     assert model.offline_buffer.size() == N_ROWS
-    assert model._n_pretrain_steps == model._n_updates == 6 and model.num_timesteps == 4
+    assert model.n_pretrain_steps == model._n_updates == 6 and model.num_timesteps == 4
     model.learn(4)
-    assert model._n_pretrain_steps == 6 and model.offline_buffer.size() == N_ROWS
+    assert model.n_pretrain_steps == 6 and model.offline_buffer.size() == N_ROWS
 
 
 def test_an_interrupted_offline_stage_does_the_rest(npz):
     model = make(offline_dataset=npz, pretrain_steps=6)
     model.pretrain(6, callback=Counting(stop_at=2))
     model.learn(4)
-    assert model._n_pretrain_steps == 6
+    assert model.n_pretrain_steps == 6
 
 
 def test_a_loaded_model_loads_the_dataset_again_only_where_its_buffer_is_empty(npz, tmp_path):

@@ -70,6 +70,11 @@ class OfflineToOnlineAlgorithm(OffPolicyAlgorithm):
         self._n_pretrain_steps = 0
         self._env_steps_before_pretrain: int | None = None
 
+    @property
+    def n_pretrain_steps(self) -> int:
+        """Gradient steps that were made by :meth:`pretrain`."""
+        return self._n_pretrain_steps
+
     def _setup_model(self) -> None:
         if self.pretrain_steps < 0:
             raise ValueError(f"pretrain_steps must be at least 0, got {self.pretrain_steps!r}")

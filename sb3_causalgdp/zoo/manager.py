@@ -141,7 +141,7 @@ class CausalGDPExperimentManager(ExperimentManager):
 
     def _pretrain(self, model: CausalGDP) -> bool:
         """The offline stage, with evaluations and checkpoints; False if it was interrupted, and the model is to be saved."""
-        gradient_steps = model.pretrain_steps - model._n_pretrain_steps
+        gradient_steps = model.pretrain_steps - model.n_pretrain_steps
         if gradient_steps <= 0:
             return True
         try:

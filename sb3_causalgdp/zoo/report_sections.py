@@ -156,9 +156,9 @@ def _summary_section(run: RunFolder, model: CausalGDP, kind: str, model_path: Pa
         ("Environment", run.environment_id or "not recorded"),
         ("Model", f"{model_path.name} ({kind}), {model.num_timesteps:,} environment steps, {model._n_updates:,} updates"),
     ]
-    if model._n_pretrain_steps > 0:
+    if model.n_pretrain_steps > 0:
         data = model.offline_dataset or "preloaded data"
-        rows.append(("Offline stage", f"{model._n_pretrain_steps:,} gradient steps on {data}"))
+        rows.append(("Offline stage", f"{model.n_pretrain_steps:,} gradient steps on {data}"))
     episodes, evaluations = run.training_episodes(), run.evaluations()
     if episodes is not None:
         rows.append(("Training", f"{_episodes(len(episodes.returns))}, the last ended after {episodes.seconds[-1]:,.0f} s"))

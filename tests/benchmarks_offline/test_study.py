@@ -57,7 +57,7 @@ def test_an_interrupted_run_makes_only_the_updates_that_are_missing(tmp_path, mo
         CausalGDPLearner, "train", lambda learner, n: (learners.append(learner), done.append(n), real(learner, n))
     )
     rows = train(*arguments)
-    assert done == [3, 3] and learners[0].model._n_pretrain_steps == 6
+    assert done == [3, 3] and learners[0].model.n_pretrain_steps == 6
     assert [row["updates"] for row in rows[:2]] == [3, 6]
 
 

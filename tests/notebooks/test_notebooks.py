@@ -104,7 +104,7 @@ def test_offline_to_online(execute, tmp_path):
     assert values["scores"][1] == pytest.approx(100 * (np.mean(values["returns"]) - 23.85) / (161.86 - 23.85))
     assert values["velocity_moves_position"] > 0.5
     model = CausalGDP.load(tmp_path / "maze2d_umaze.zip")
-    assert (model._n_pretrain_steps, model.num_timesteps) == (40, 120)
+    assert (model.n_pretrain_steps, model.num_timesteps) == (40, 120)
 
 
 def test_what_causes_what(execute, tmp_path):

@@ -63,7 +63,7 @@ def test_an_offline_task_pretrains_then_trains(dataset, zoo, tiny, folder, capsy
     assert (run / "offline" / "rl_model_20_steps.zip").is_file() and (run / "rl_model_40_steps.zip").is_file()
     assert (run / "offline-sb3_causalgdp-maze2d-umaze-v0" / "vecnormalize.pkl").is_file()
     model = CausalGDP.load(run / "offline-sb3_causalgdp-maze2d-umaze-v0.zip", device="cpu")
-    assert (model._n_pretrain_steps, model.num_timesteps) == (30, 40)
+    assert (model.n_pretrain_steps, model.num_timesteps) == (30, 40)
     assert all(isinstance(rate, LinearSchedule) for rate in (model.critic_learning_rate, model.offline_fraction))
     assert model.lr_schedule(1.0) == pytest.approx(3e-4) and model.lr_schedule(0.5) == pytest.approx(1.5e-4)
     assert model.causal_graph().n_samples > 600
@@ -89,7 +89,7 @@ def test_an_offline_stage_that_is_interrupted_is_saved_and_goes_on(dataset, zoo,
     assert CausalGDP.load(first, device="cpu")._n_pretrain_steps == 10
     zoo(*common, "-i", first)
     model = CausalGDP.load(folder / "logs" / "causalgdp" / f"{name}_2" / f"{name}.zip", device="cpu")
-    assert (model._n_pretrain_steps, model.num_timesteps, model._n_updates) == (30, 0, 30)
+    assert (model.n_pretrain_steps, model.num_timesteps, model._n_updates) == (30, 0, 30)
 
 
 @pytest.mark.filterwarnings("ignore")

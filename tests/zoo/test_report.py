@@ -3,10 +3,14 @@
 import base64
 import html.parser
 import io
+import json
 import os
 import shutil
+import subprocess
+import sys
 import zipfile
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -109,7 +113,9 @@ def full_page(zoo, trained, tmp_path_factory):
     add_history(folder / "run_1" / "Pendulum-v1.zip")
     path = folder / "pages" / "page.html"
     zoo("report", folder / "run_1", "-o", path, "--episodes", 2, "--device", "cpu")
-    return Page(path)
+    page = Page(path)
+    page.path = path
+    return page
 
 
 def add_history(path):
@@ -144,6 +150,25 @@ def test_its_pictures_decode_and_show_something(full_page):
     for title in SECTIONS:
         for image in full_page.images(title):
             assert image.format == "PNG" and np.asarray(image.convert("L")).std() > 5.0
+
+
+def test_a_browser_shows_all_of_it_and_complains_of_nothing(full_page, tmp_path):
+    pytest.importorskip("PyQt6.QtWebEngineWidgets")
+    surroundings = {"QT_QPA_PLATFORM": "offscreen", "QTWEBENGINE_CHROMIUM_FLAGS": "--no-sandbox --disable-gpu"}
+    done = subprocess.run(
+        [sys.executable, Path(__file__).with_name("browser.py"), full_page.path, tmp_path / "page.png"],
+        env={**os.environ, **surroundings},
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert done.returncode == 0, done.stderr
+    facts = json.loads(done.stdout.splitlines()[-1])
+    assert "Pendulum-v1" in facts["title"]
+    assert len(facts["pictures"]) == 6 and all(natural > 0 and 0 < shown <= 1200 for natural, shown in facts["pictures"])
+    assert facts["links"] == [True] * len(SECTIONS) and facts["visible"] == [True] * len(SECTIONS)
+    assert facts["overflow"] <= 0 and facts["complaints"] == []
+    assert np.asarray(Image.open(tmp_path / "page.png").convert("L")).std() > 5.0
 
 
 def test_it_says_what_the_run_was(full_page):
