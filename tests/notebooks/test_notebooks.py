@@ -66,7 +66,14 @@ def execute(tmp_path, monkeypatch):
         values = ", ".join(f"{key!r}: {expression}" for key, expression in results.items())
         notebook.cells.append(nbformat.v4.new_code_cell(f"import json\nprint(json.dumps({{{values}}}))"))
         resources = {"metadata": {"path": str(tmp_path)}}
-        nbclient.NotebookClient(notebook, timeout=SECONDS_PER_CELL, kernel_name="python3", resources=resources).execute()
+        # On a busy machine a kernel can take more than nbclient's minute to start
+        nbclient.NotebookClient(
+            notebook,
+            timeout=SECONDS_PER_CELL,
+            startup_timeout=SECONDS_PER_CELL,
+            kernel_name="python3",
+            resources=resources,
+        ).execute()
         return json.loads(notebook.cells[-1].outputs[-1].text)
 
     return run

@@ -205,6 +205,8 @@ def test_a_stock_algorithm_trains_and_plays_through_the_same_entry(zoo, folder, 
 
 def test_interrupted_training_leaves_a_model_that_loads(folder):
     command = [sys.executable, "-u", "-m", "sb3_causalgdp.zoo", "train", *PENDULUM, "-f", "logs", "--eval-freq", "-1"]
+    # Longer than a busy machine could need to read the line
+    command += ["-n", "1000000"]
     # With a progress bar, and a callback that says when the training runs
     (folder / "says.py").write_text(
         "from stable_baselines3.common.callbacks import BaseCallback\n"
@@ -230,7 +232,7 @@ def test_interrupted_training_leaves_a_model_that_loads(folder):
                 process.send_signal(signal.SIGINT)
     assert process.returncode == 0, "".join(output)
     model = CausalGDP.load("logs/causalgdp/Pendulum-v1_1/Pendulum-v1.zip", device="cpu")
-    assert 120 <= model.num_timesteps < 10_000
+    assert 120 <= model.num_timesteps < 1_000_000
     env = gym.make("Pendulum-v1")
     action, _ = model.predict(env.reset(seed=0)[0])
     assert env.action_space.contains(action)
