@@ -13,7 +13,7 @@ from sb3_causalgdp import CausalGDP
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--total-timesteps", type=int, default=8_000)
+    parser.add_argument("--total-timesteps", type=int, default=10_000)
     parser.add_argument("--output-folder", type=Path, default=Path("."))
     args = parser.parse_args()
     args.output_folder.mkdir(parents=True, exist_ok=True)
