@@ -15,7 +15,8 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.type_aliases import PyTorchObs
 
 from sb3_causalgdp.causal.effect_plots import plot_action_effects
-from sb3_causalgdp.causal.graph import PLOTS_HINT, replaced_when_done
+from sb3_causalgdp.causal.figures import FONT_SIZE, save_figure
+from sb3_causalgdp.causal.graph import PLOTS_HINT
 from sb3_causalgdp.causal.plots import plot_causal_graph
 from sb3_causalgdp.causalgdp import CausalGDP
 from sb3_causalgdp.diagnostics import step_divergences
@@ -28,8 +29,6 @@ except ImportError as error:
     raise ImportError(PLOTS_HINT) from error
 
 TEXT_FORMATS = (sb3_logger.HumanOutputFormat, sb3_logger.JSONOutputFormat, sb3_logger.CSVOutputFormat)
-DPI = 120
-FONT_SIZE = 9
 KL_COLOUR = "#2166ac"
 
 
@@ -154,9 +153,7 @@ def plot_guidance_strength(divergences: th.Tensor | np.ndarray, path: str | os.P
         f"(mean of {n_observations} observations; lines: 5 % to 95 %)",
         fontsize=FONT_SIZE + 1,
     )
-    if path is not None:
-        with replaced_when_done(path) as temporary:
-            figure.savefig(temporary, dpi=DPI)
+    save_figure(figure, path)
     return figure
 
 

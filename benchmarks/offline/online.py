@@ -31,6 +31,7 @@ from benchmarks.offline.methods import CAUSALGDP_METHODS, study_arguments
 from benchmarks.suite.jobs import grid
 from benchmarks.suite.run import add_run_options, run_from_options
 from sb3_causalgdp import CausalGDP
+from sb3_causalgdp.causal.figures import save_figure
 from sb3_causalgdp.offline.make import MAZE_TASKS
 from sb3_causalgdp.offline.mujoco_tasks import MUJOCO_TASKS
 from sb3_causalgdp.offline.scores import normalized_score
@@ -82,7 +83,7 @@ def fine_tune(
             done = until
             envs.seed(EVALUATION_SEED)
             returns, _ = evaluate_policy(model, envs, episodes, return_episode_rewards=True)
-            scores = np.array([normalized_score(task, [value]).mean for value in np.asarray(returns)])
+            scores = normalized_score(task, returns).values
             row = {"stage": stage, "count": done, "score": round(scores.mean(), 2), "std": round(scores.std(), 2)}
             rows.append({**row, "episodes": len(scores), "cpu_seconds": round(time.process_time() - start, 1)})
             print(json.dumps(rows[-1]), flush=True)
@@ -122,9 +123,7 @@ def draw(table: pd.DataFrame, path: Path) -> None:
         axes.set(title=task, xlabel="gradient updates, then environment steps", ylabel="D4RL's normalised score")
         axes.grid(alpha=0.3)
         axes.legend(frameon=False)
-    temporary = path.with_name(f".{path.name}")
-    figure.savefig(temporary, dpi=110, format="png")
-    temporary.replace(path)
+    save_figure(figure, path)
 
 
 def hand_over(table: pd.DataFrame) -> str:

@@ -15,6 +15,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from benchmarks.offline.methods import METHODS
+from sb3_causalgdp.causal.figures import save_figure
 
 RESULTS = Path(__file__).parent / "results"
 LABELS = {
@@ -158,9 +159,7 @@ def _save(figure: Figure, path: Path) -> None:
         for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
             handles.setdefault(label, handle)
     figure.legend(list(handles.values()), list(handles), loc="outside lower center", ncols=4, frameon=False)
-    temporary = path.with_name(f".{path.name}")
-    figure.savefig(temporary, dpi=110, format="png")
-    temporary.replace(path)
+    save_figure(figure, path)
 
 
 def main() -> None:

@@ -2,7 +2,8 @@ import os
 
 import numpy as np
 
-from sb3_causalgdp.causal.graph import PLOTS_HINT, replaced_when_done
+from sb3_causalgdp.causal.figures import FONT_SIZE, INCHES_PER_CHARACTER, save_figure
+from sb3_causalgdp.causal.graph import PLOTS_HINT
 from sb3_causalgdp.causal.interventions import ActionEffects
 
 try:
@@ -15,8 +16,6 @@ except ImportError as error:
 
 COLOUR_MAP = "RdBu_r"
 POSITIVE, NEGATIVE, PALE, NO_PATH = "#b2182b", "#2166ac", "#dddddd", "#e2e2e2"
-FONT_SIZE = 9
-INCHES_PER_CHARACTER = 0.095  # at FONT_SIZE, on the generous side
 ROW_INCHES = 0.32
 CELL_INCHES = 0.52
 MAX_NUMBERS = 300
@@ -52,9 +51,7 @@ def plot_action_effects(
         f"mean of {effects.n_observations} observations",
         fontsize=FONT_SIZE + 1,
     )
-    if path is not None:
-        with replaced_when_done(path) as temporary:
-            figure.savefig(temporary, dpi=120)
+    save_figure(figure, path)
     return figure
 
 

@@ -31,15 +31,20 @@ def test_a_callable_that_does_not_say_needs_one_row():
     assert min_rows(lambda statistics, variables, previous=None: CausalGraph.fully_connected(variables), VARIABLES) == 1
 
 
+def rows_that_cannot_be_told_apart():
+    """Two states are multiples of each other, an action is constant."""
+    rows = np.random.default_rng(0).standard_normal((200, VARIABLES.n_variables))
+    rows[:, 1] = -2.0 * rows[:, 0]
+    rows[:, 4] = 1.0
+    return rows
+
+
 @pytest.mark.parametrize("name", METHODS)
 def test_a_graph_says_when_it_was_found_and_what_the_data_cannot_say(name):
     kwargs, _ = METHODS[name]
     if name == "direct_lingam":
         pytest.importorskip("lingam")
-    rows = np.random.default_rng(0).standard_normal((200, VARIABLES.n_variables))
-    rows[:, 1] = -2.0 * rows[:, 0]
-    rows[:, 4] = 1.0
-    graph = discover(name, rows, VARIABLES, **kwargs)
+    graph = discover(name, rows_that_cannot_be_told_apart(), VARIABLES, **kwargs)
     assert graph.found_at.endswith("+00:00") and graph.constant_variables == ("pull",)
     assert graph.duplicated_variables == (("x", "y"),)
     np.testing.assert_array_equal(graph.masks[:, 0][:3], graph.masks[:, 1][:3])
@@ -53,8 +58,7 @@ def test_causes_that_cannot_be_told_apart_are_an_error_if_asked_for(name):
         pytest.importorskip("lingam")
     rows = np.random.default_rng(0).standard_normal((200, VARIABLES.n_variables))
     discover(name, rows, VARIABLES, **kwargs, on_degenerate="raise")
-    rows[:, 1] = -2.0 * rows[:, 0]
-    rows[:, 4] = 1.0
+    rows = rows_that_cannot_be_told_apart()
     with pytest.raises(ValueError, match=r"constant \['pull'\], linearly dependent \[\['x', 'y'\]\]"):
         discover(name, rows, VARIABLES, **kwargs, on_degenerate="raise")
     with pytest.raises(ValueError, match="on_degenerate must be 'share' or 'raise', got 'ignore'"):
