@@ -18,6 +18,7 @@ from torch import nn
 
 from sb3_causalgdp.causal.world_model import MaskedBlocks, MaskedWorldModel
 from sb3_causalgdp.diffusion import MLPDenoiser
+from sb3_causalgdp.diffusion.activations import fast
 from sb3_causalgdp.diffusion.samplers import transition_weights
 
 Policy = Any  # a CausalGDPPolicy, whose file imports this one
@@ -66,34 +67,49 @@ def _clip(action: np.ndarray) -> np.ndarray:
 
 
 Layer = tuple[np.ndarray, np.ndarray]
+"""A weight, shape ``(outputs, inputs)``, and a bias, shape ``(outputs, 1)``."""
 
 
 def _view(tensor: th.Tensor) -> np.ndarray:
     return tensor.detach().numpy()
 
 
+def _layer(linear: nn.Linear) -> Layer:
+    return _view(linear.weight), _view(linear.bias)[:, None]
+
+
 def _linear_layers(modules: Any, activation: type[nn.Module]) -> list[Layer] | None:
-    """Weights, transposed, and biases of layers with that activation between them; None if there is anything else."""
+    """The layers, with that activation between them; None if there is anything else."""
     layers = []
     for module in modules:
         if isinstance(module, nn.Linear) and module.bias is not None:
-            layers.append((_view(module.weight).T, _view(module.bias)))
-        elif type(module) is not activation:
+            layers.append(_layer(module))
+        elif type(module) is not activation and type(module) is not fast(activation):
             return None
     return layers
 
 
+def _through(gradient: np.ndarray, jacobian: np.ndarray) -> np.ndarray:
+    """Gradient by the next state, shape ``(batch, n)``, times its Jacobian, ``(n, batch, d)``: shape ``(batch, d)``."""
+    return (gradient[:, None] @ jacobian.transpose(1, 0, 2))[:, 0]
+
+
 class _Denoiser:
-    """The denoiser and the noise-schedule's coefficients of each reverse step."""
+    """
+    The denoiser and the noise schedule's coefficients of each reverse step.
+
+    Rows of a batch are columns here, as in the critics: weights times a few columns take half the time of a few rows times
+    transposed weights.
+    """
 
     def __init__(self, policy: Policy) -> None:
         actor, denoiser = policy.actor, policy.actor.denoiser
-        weight = _view(denoiser.input_layer.weight).T
+        weight, self.bias = _layer(denoiser.input_layer)
         first_time = denoiser.action_dim
         first_condition = first_time + denoiser.time_table.shape[1]
-        self.action_weight, self.condition_weight = weight[:first_time], weight[first_condition:]
-        self.time_weight, self.bias = weight[first_time:first_condition], _view(denoiser.input_layer.bias)
-        self.time_table = _view(denoiser.time_table)
+        self.action_weight, self.condition_weight = weight[:, :first_time], weight[:, first_condition:]
+        self.time_weight = weight[:, first_time:first_condition]
+        self.time_table = _view(denoiser.time_table).T
         time_layers = _linear_layers(denoiser.time_mlp, nn.Mish)
         layers = _linear_layers(denoiser.network, actor.activation_fn)
         assert time_layers is not None and layers is not None
@@ -103,26 +119,28 @@ class _Denoiser:
         eta = 1.0 if actor.sampler == "ddpm" else actor.ddim_eta
         self.weights = [transition_weights(actor.schedule, step, eta) for step in range(actor.schedule.n_steps)]
 
-    def bind(self, features: np.ndarray) -> list[np.ndarray]:
-        """The first layer without the noisy action's part, for each diffusion step."""
+    def time_part(self) -> np.ndarray:
+        """The diffusion steps' part of the first layer, bias included, shape ``(K, width, 1)``."""
         (weight, bias), (last_weight, last_bias) = self.time_layers
-        embedding = ACTIVATIONS[nn.Mish].value(self.time_table @ weight + bias) @ last_weight + last_bias
-        from_time = embedding @ self.time_weight
-        from_condition = features @ self.condition_weight + self.bias
-        return [from_condition + from_time[step] for step in range(len(from_time))]
+        embedding = last_weight @ ACTIVATIONS[nn.Mish].value(weight @ self.time_table + bias) + last_bias
+        return (self.time_weight @ embedding + self.bias).T[:, :, None]
+
+    def bind(self, features: np.ndarray, time_part: np.ndarray) -> np.ndarray:
+        """The first layer without the noisy action's part, for each diffusion step, shape ``(K, width, batch)``."""
+        return time_part + self.condition_weight @ features
 
     def predict_noise(self, noisy_action: np.ndarray, from_rest: np.ndarray) -> np.ndarray:
-        hidden = noisy_action @ self.action_weight
+        hidden = self.action_weight @ noisy_action
         hidden += from_rest
         for weight, bias in self.layers:
-            hidden = self.activation(hidden) @ weight
+            hidden = weight @ self.activation(hidden)
             hidden += bias
         return hidden
 
     def sample(
-        self, bound: list[np.ndarray], noise: np.ndarray, shift: Callable[[np.ndarray, int], np.ndarray] | None = None
+        self, bound: np.ndarray, noise: np.ndarray, shift: Callable[[np.ndarray, int], np.ndarray] | None = None
     ) -> np.ndarray:
-        """The chain of :func:`sb3_causalgdp.diffusion.sample`."""
+        """The chain of :func:`sb3_causalgdp.diffusion.sample`; noise of shape ``(K, d, batch)``, actions ``(d, batch)``."""
         action, n_steps = noise[0], len(noise)
         for position, step in enumerate(reversed(range(n_steps))):
             alpha_bar = self.schedule.alpha_bar_list[step]
@@ -150,38 +168,48 @@ class _Critics:
         self.activation = ACTIVATIONS[policy.activation_fn]
 
     def values(self, features: np.ndarray, actions: np.ndarray, n_candidates: int) -> np.ndarray:
-        """Smallest Q of several actions for each row of features; the features' part of the first layer is computed once."""
+        """Smallest Q of several actions for each features; the features' part of the first layer is computed once."""
         smallest = None
         for (weight, bias), *layers in self.networks:
-            hidden = np.repeat(features @ weight[: features.shape[1]] + bias, n_candidates, axis=0)
-            hidden += actions @ weight[features.shape[1] :]
+            hidden = np.repeat(weight[:, : len(features)] @ features + bias, n_candidates, axis=1)
+            hidden += weight[:, len(features) :] @ actions
             for next_weight, next_bias in layers:
-                hidden = self.activation.value(hidden) @ next_weight
+                hidden = next_weight @ self.activation.value(hidden)
                 hidden += next_bias
             smallest = hidden if smallest is None else np.minimum(smallest, hidden)
         assert smallest is not None
-        return smallest[:, 0]
+        return smallest[0]
 
     def gradient(self, state: np.ndarray, action: np.ndarray) -> np.ndarray:
-        """Of the smallest Q, by the state, shape ``(batch, n)``."""
-        inputs = np.concatenate([state, action], axis=1)
-        values, gradients = zip(*(self._value_and_gradient(layers, inputs) for layers in self.networks), strict=True)
-        smallest = np.argmin(np.concatenate(values, axis=1), axis=1)
-        return np.stack(gradients)[smallest, np.arange(len(state)), : state.shape[1]]
+        """Of the smallest Q, by the state, shape ``(n, batch)``."""
+        inputs = np.concatenate([state, action])
+        passes = [self._forward(layers, inputs) for layers in self.networks]
+        smallest = np.argmin(np.concatenate([values for values, _ in passes]), axis=0)
+        gradient = np.empty_like(state)
+        for index, (layers, (_, hidden)) in enumerate(zip(self.networks, passes, strict=True)):
+            columns = smallest == index
+            if columns.any():
+                chosen = [(before[:, columns], after[:, columns]) for before, after in hidden]
+                gradient[:, columns] = self._backward(layers, chosen, len(state))
+        return gradient
 
-    def _value_and_gradient(
-        self, layers: list[tuple[np.ndarray, np.ndarray]], hidden: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        derivatives = []
+    def _forward(self, layers: list[Layer], inputs: np.ndarray) -> tuple[np.ndarray, list[tuple[np.ndarray, np.ndarray]]]:
+        """The values, and of each hidden layer what went into its activation and what came out."""
+        hidden = []
         for weight, bias in layers[:-1]:
-            before = hidden @ weight + bias
-            hidden = self.activation.value(before)
-            derivatives.append(self.activation.derivative(before, hidden))
+            before = weight @ inputs
+            before += bias
+            inputs = self.activation.value(before)
+            hidden.append((before, inputs))
         weight, bias = layers[-1]
-        gradient = np.broadcast_to(weight.T, hidden.shape)
-        for (earlier_weight, _), derivative in zip(reversed(layers[:-1]), reversed(derivatives), strict=True):
-            gradient = (gradient * derivative) @ earlier_weight.T
-        return hidden @ weight + bias, gradient
+        return weight @ inputs + bias, hidden
+
+    def _backward(self, layers: list[Layer], hidden: list[tuple[np.ndarray, np.ndarray]], n_states: int) -> np.ndarray:
+        gradient = layers[-1][0].T
+        for (weight, _), (before, after) in zip(reversed(layers[1:-1]), reversed(hidden[1:]), strict=True):
+            gradient = weight.T @ (gradient * self.activation.derivative(before, after))
+        weight = layers[0][0][:, :n_states]
+        return weight.T @ (gradient * self.activation.derivative(*hidden[0])) if hidden else weight.T
 
 
 class _Blocks:
@@ -236,7 +264,7 @@ class _WorldModel:
         reward_mask = np.concatenate([arrays["state_to_reward"], arrays["action_to_reward"]])[None]
         reward, reward_gradient = self.reward.forward_and_jacobian(reward_inputs, reward_mask, 0)
         by_next_state = reward_gradient[0, :, :n_states] * (np.abs(next_standardised) <= bound)
-        total = reward_gradient[0, :, n_states:] + np.einsum("bj,jbi->bi", by_next_state, next_jacobian)
+        total = reward_gradient[0, :, n_states:] + _through(by_next_state, next_jacobian)
         lowest, highest = self.model.LOG_STD_BOUNDS
         return {
             "next_state": arrays["state_mean"] + state_std * next_standardised,
@@ -315,55 +343,63 @@ class NumpyActing:
         :return: Actions in [-1, 1], shape ``(batch, d)``
         """
         # On products this small, several threads of numpy's library mostly wait for each other: ten times the time
+        if all(library.num_threads == 1 for library in self._blas.lib_controllers):
+            return self._act(policy, features, noise, guided)
         with self._blas.limit(limits=1):
             return self._act(policy, features, noise, guided)
 
     def _act(self, policy: Policy, features: np.ndarray, noise: np.ndarray, guided: bool) -> np.ndarray:
         n_candidates = policy.n_action_candidates
-        bound = self.denoiser.bind(features)
-        repeated = bound if n_candidates == 1 else [np.repeat(part, n_candidates, axis=0) for part in bound]
+        time_part = self.denoiser.time_part()
+        bound = self.denoiser.bind(features.T, time_part)
+        noise = noise.transpose(0, 2, 1)
+        repeated = bound if n_candidates == 1 else np.repeat(bound, n_candidates, axis=2)
         candidates = self.denoiser.sample(repeated, noise)
-        best = np.arange(0, len(candidates), n_candidates)
+        best = np.arange(0, noise.shape[2], n_candidates)
         if n_candidates > 1:
-            values = self.critics.values(features, candidates, n_candidates)
+            values = self.critics.values(features.T, candidates, n_candidates)
             best = best + values.reshape(-1, n_candidates).argmax(axis=1)
-        action = candidates[best]
+        action = candidates.T[best]
         if not guided:
             return action
-        shift = self._shift(policy, action, *self._local_model(policy, features, action))
-        return self.denoiser.sample(bound, noise[:, best], shift)
+        shift = self._shift(policy, action, *self._local_model(policy, features, action, time_part))
+        return np.ascontiguousarray(self.denoiser.sample(bound, noise[:, :, best], shift).T)
 
     def _shift(
         self, policy: Policy, best: np.ndarray, gradient: np.ndarray, curvature: np.ndarray
     ) -> Callable[[np.ndarray, int], np.ndarray]:
-        """What the linearised guidance takes off the predicted noise, see ``guidance_shift``."""
+        """What the linearised guidance adds to the clean action's estimate, divided by a factor: see ``guidance_shift``."""
         rule, alpha_bar = self.rule, np.array(policy.actor.schedule.alpha_bar_list, dtype=best.dtype)
         assert rule is not None
-        factor = np.broadcast_to(rule.scales, alpha_bar.shape).astype(best.dtype) * np.sqrt(1.0 - alpha_bar)
+        factor = np.asarray(rule.scales, dtype=best.dtype) * np.sqrt(1.0 - alpha_bar)
+        if rule.mode == "normalized":
+
+            def normalized_shift(clean: np.ndarray, step: int) -> np.ndarray:
+                direction = gradient - (curvature @ (clean.T - best)[:, :, None])[:, :, 0]
+                return (factor[step] * direction / np.maximum(np.linalg.norm(direction, axis=1, keepdims=True), 1e-8)).T
+
+            return normalized_shift
+        # Linear in the clean action: what the diffusion steps multiply and add is found for all of them at once
+        at_zero = (gradient + (curvature @ best[:, :, None])[:, :, 0])[:, :, None]
         if rule.mode == "posterior":
-            # The systems of all diffusion steps in one call
-            identity = np.eye(best.shape[1], dtype=best.dtype)
-            systems = identity + (1.0 - alpha_bar)[:, None, None, None] * curvature
+            systems = np.eye(best.shape[1], dtype=best.dtype) + (1.0 - alpha_bar)[:, None, None, None] * curvature
             size = np.abs(systems).max(axis=(2, 3), keepdims=True)
-            inverses = np.linalg.inv(systems + 8.0 * np.finfo(best.dtype).eps * size * identity)
-            factor = factor * np.sqrt(alpha_bar)
+            systems += 8.0 * np.finfo(best.dtype).eps * size * np.eye(best.shape[1], dtype=best.dtype)
+            factors = (factor * np.sqrt(alpha_bar))[:, None, None, None] * np.linalg.inv(systems)
+        else:
+            factors = factor[:, None, None, None] * np.eye(best.shape[1], dtype=best.dtype)
+        slopes, offsets = factors @ curvature, factors @ at_zero
+        return lambda clean, step: (offsets[step] - slopes[step] @ clean.T[:, :, None])[:, :, 0].T
 
-        def shift(clean: np.ndarray, step: int) -> np.ndarray:
-            direction = gradient - (curvature @ (clean - best)[:, :, None])[:, :, 0]
-            if rule.mode == "normalized":
-                direction = direction / np.maximum(np.linalg.norm(direction, axis=1, keepdims=True), 1e-8)
-            elif rule.mode == "posterior":
-                direction = (inverses[step] @ direction[:, :, None])[:, :, 0]
-            return factor[step] * direction
-
-        return shift
-
-    def _local_model(self, policy: Policy, state: np.ndarray, action: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _local_model(
+        self, policy: Policy, state: np.ndarray, action: np.ndarray, time_part: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Gradient and curvature of the guidance at the best candidate, whose predicted state is the one to reach."""
         response = self.world_model.response(state, action)
         if policy.guidance_target == "return":
             error = np.ones(len(state), dtype=state.dtype)
-            jacobian = response["reward_jacobian"] + policy.discount * self._value_jacobian(policy, response, action)
+            through_value = self._value_jacobian(policy, response, action, time_part)
+            jacobian = response["reward_jacobian"] + policy.discount * through_value
             jacobian = jacobian / _view(policy.return_std)
         else:
             error = (_view(policy.reward_target) - response["reward"]) / response["reward_std"]
@@ -376,9 +412,11 @@ class NumpyActing:
             curvature = curvature + np.float32(policy.state_guidance_scale) * (by_state.transpose(0, 2, 1) @ by_state)
         return gradient, curvature
 
-    def _value_jacobian(self, policy: Policy, response: dict[str, np.ndarray], action: np.ndarray) -> np.ndarray:
-        next_state = response["next_state"]
-        noise = np.zeros((policy.actor.schedule.n_steps, *action.shape), dtype=action.dtype)
-        next_action = self.denoiser.sample(self.denoiser.bind(next_state), noise)
+    def _value_jacobian(
+        self, policy: Policy, response: dict[str, np.ndarray], action: np.ndarray, time_part: np.ndarray
+    ) -> np.ndarray:
+        next_state = response["next_state"].T
+        noise = np.zeros((policy.actor.schedule.n_steps, *action.T.shape), dtype=action.dtype)
+        next_action = self.denoiser.sample(self.denoiser.bind(next_state, time_part), noise)
         by_state = self.critics.gradient(next_state, next_action)
-        return np.einsum("bj,jbi->bi", by_state, response["next_state_jacobian"])
+        return _through(by_state.T, response["next_state_jacobian"])

@@ -82,6 +82,8 @@ class CausalGDP(OfflineToOnlineAlgorithm):
     :param actor_update: Which action the Q term of the policy loss judges. ``one_step``: the clean action that the noise
         prediction of the denoising term gives already (EDP, https://arxiv.org/abs/2305.20081), half the cost of an update;
         ``chain``: the end of the whole chain, through which the gradient then flows (Diffusion-QL)
+    :param policy_delay: The actor is updated once every so many gradient steps, as in TD3
+    :param world_model_delay: The world model is updated once every so many gradient steps
     :param max_q_backup: Whether the TD target takes the best of ten sampled actions (Diffusion-QL, for AntMaze)
     :param max_grad_norm: Bound of the gradient norms of the actor and of the critics, None for no bound
     :param diffusion_steps: Number of diffusion steps K
@@ -173,6 +175,8 @@ class CausalGDP(OfflineToOnlineAlgorithm):
         eta: float = 1.0,
         denoising_weight: float = 0.05,
         actor_update: str = "one_step",
+        policy_delay: int = 1,
+        world_model_delay: int = 2,
         max_q_backup: bool = False,
         max_grad_norm: float | None = None,
         diffusion_steps: int = 5,
@@ -241,6 +245,8 @@ class CausalGDP(OfflineToOnlineAlgorithm):
         self.eta = eta
         self.denoising_weight = denoising_weight
         self.actor_update = actor_update
+        self.policy_delay = policy_delay
+        self.world_model_delay = world_model_delay
         self.max_q_backup = max_q_backup
         self.max_grad_norm = max_grad_norm
         self.diffusion_steps = diffusion_steps
@@ -326,6 +332,10 @@ class CausalGDP(OfflineToOnlineAlgorithm):
                 raise ValueError(f"{name} must be a finite number of at least 0, got {value!r}")
         if self.causal_refresh_freq < 1:
             raise ValueError(f"causal_refresh_freq must be at least 1 environment step, got {self.causal_refresh_freq!r}")
+        for name in ("policy_delay", "world_model_delay"):
+            delay = getattr(self, name)
+            if not isinstance(delay, int) or isinstance(delay, bool) or delay < 1:
+                raise ValueError(f"{name} must be an integer of at least 1 gradient step, got {delay!r}")
         if self.actor_update not in ACTOR_UPDATES:
             raise ValueError(f"Unknown actor_update {self.actor_update!r}: it must be one of {list(ACTOR_UPDATES)}")
         threads = self.torch_threads
@@ -500,11 +510,13 @@ class CausalGDP(OfflineToOnlineAlgorithm):
                 # What a CUDA graph returned is overwritten from here on
                 th.compiler.cudagraph_mark_step_begin()
             next_actions, step_losses = self._update_critics(replay_data)
-            step_losses.update(self._update_world_model(one_step))
-            if one_step is not replay_data:
-                with th.no_grad():
-                    next_actions = self.actor_target.sample(self.actor_target.features(one_step.next_observations))
-            step_losses.update(self._update_actor(one_step, next_actions))
+            if self._n_updates % self.world_model_delay == 0:
+                step_losses.update(self._update_world_model(one_step))
+            if self._n_updates % self.policy_delay == 0:
+                if one_step is not replay_data:
+                    with th.no_grad():
+                        next_actions = self.actor_target.sample(self.actor_target.features(one_step.next_observations))
+                step_losses.update(self._update_actor(one_step, next_actions))
             self._update_targets()
             for name, loss in step_losses.items():
                 losses.setdefault(name, []).append(loss.detach().clone())

@@ -22,7 +22,7 @@ from sb3_causalgdp.acting import NumpyActing
 from sb3_causalgdp.causal import CausalGuidance, LinearisedGuidance, MaskedWorldModel, ReturnTarget, RewardTarget
 from sb3_causalgdp.causal.guidance import OutcomeTarget
 from sb3_causalgdp.diffusion import Guidance, GuidanceRule, MLPDenoiser, NoiseSchedule, sample
-from sb3_causalgdp.diffusion.denoisers import in_place
+from sb3_causalgdp.diffusion.activations import fast
 from sb3_causalgdp.diffusion.samplers import check_sampler
 
 ACTIVATIONS: dict[str, type[nn.Module]] = {
@@ -310,7 +310,7 @@ class CausalGDPPolicy(BasePolicy):
         self.actor_kwargs = {**shared_kwargs, "net_arch": actor_arch, **self.diffusion_kwargs}
         self.critic_kwargs = {
             **shared_kwargs,
-            "activation_fn": in_place(self.activation_fn),
+            "activation_fn": fast(self.activation_fn),
             "net_arch": critic_arch,
             "n_critics": n_critics,
             "share_features_extractor": share_features_extractor,
@@ -397,7 +397,10 @@ class CausalGDPPolicy(BasePolicy):
 
         :param mode: Whether to train
         """
-        for module in (self.actor, self.critic, self.world_model):
+        modules = (self.actor, self.critic, self.world_model)
+        if all(module.training == mode for module in (self, *modules)):
+            return  # every prediction asks for it, and visiting all layers would take a fifth of its time
+        for module in modules:
             module.train(mode)
         self.training = mode
 
@@ -527,16 +530,20 @@ class CausalGDPPolicy(BasePolicy):
         return action
 
     def _act(self, observation: PyTorchObs, deterministic: bool) -> th.Tensor:
-        features = self.actor.features(observation)
-        noise = self._candidate_noise(len(features), deterministic)
-        acting = self._numpy_acting(noise.shape[1])
+        acting = self._numpy_acting(observation)
         if acting is not None:
-            return th.as_tensor(acting(self, features.numpy(), noise.numpy(), self.is_guided))
-        return self._act_in_torch(observation, features, noise)
+            assert isinstance(observation, th.Tensor)
+            features = observation.float().flatten(1).numpy()
+            noise = self._candidate_noise(len(features), deterministic).numpy()
+            return th.as_tensor(acting(self, features, noise, self.is_guided))
+        features = self.actor.features(observation)
+        return self._act_in_torch(observation, features, self._candidate_noise(len(features), deterministic))
 
-    def _numpy_acting(self, n_rows: int) -> NumpyActing | None:
+    def _numpy_acting(self, observation: PyTorchObs) -> NumpyActing | None:
         """The fast path for few rows, where it covers this policy; made anew when the networks were moved or replaced."""
-        if n_rows > NumpyActing.MOST_ROWS or self.training:
+        if self.training or not isinstance(observation, th.Tensor):
+            return None
+        if len(observation) * self.n_action_candidates > NumpyActing.MOST_ROWS:
             return None
         if self._acting is not None and not self._acting.is_current(self):
             self._acting = None
@@ -557,7 +564,7 @@ class CausalGDPPolicy(BasePolicy):
 
     def _candidate_noise(self, n_observations: int, deterministic: bool) -> th.Tensor:
         if deterministic:
-            return self.candidate_noise.repeat(1, n_observations, 1)
+            return self.candidate_noise if n_observations == 1 else self.candidate_noise.repeat(1, n_observations, 1)
         n_steps, n_candidates, action_dim = self.candidate_noise.shape
         return th.randn(n_steps, n_observations * n_candidates, action_dim, device=self.candidate_noise.device)
 

@@ -47,6 +47,30 @@ def test_the_guidance_in_the_loss_climbs_one_critic_and_in_acting_the_smallest()
     th.testing.assert_close(policy.value_gradient(states, actions), smallest)
 
 
+# Delayed updates --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("policy_delay, world_model_delay", [(1, 1), (2, 3), (3, 2)])
+def test_actor_and_world_model_are_updated_once_every_so_many_gradient_steps(policy_delay, world_model_delay):
+    model = trained_model(policy_delay=policy_delay, world_model_delay=world_model_delay)
+    modules = {"actor": model.actor, "critic": model.critic, "world_model": model.world_model}
+    delays = {"actor": policy_delay, "critic": 1, "world_model": world_model_delay}
+    for _ in range(6):
+        before = {name: th.nn.utils.parameters_to_vector(module.parameters()).clone() for name, module in modules.items()}
+        model.train(gradient_steps=1, batch_size=32)
+        changed = {
+            name: not th.equal(before[name], th.nn.utils.parameters_to_vector(modules[name].parameters())) for name in modules
+        }
+        assert changed == {name: model._n_updates % delay == 0 for name, delay in delays.items()}
+
+
+@pytest.mark.parametrize("name", ["policy_delay", "world_model_delay"])
+@pytest.mark.parametrize("delay", [0, -1, 1.5, True, "2", None])
+def test_a_delay_that_is_no_number_of_gradient_steps_is_refused(name, delay):
+    with pytest.raises(ValueError, match=rf"{name} must be an integer of at least 1 gradient step, got"):
+        CausalGDP("MlpPolicy", "Pendulum-v1", **{name: delay})
+
+
 # The action that the Q term judges --------------------------------------------------------------------------------------
 
 

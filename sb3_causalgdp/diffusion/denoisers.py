@@ -2,12 +2,13 @@
 
 import math
 from collections.abc import Callable
-from functools import partial
 from itertools import pairwise
 
 import torch as th
 import torch.nn.functional as F
 from torch import nn
+
+from sb3_causalgdp.diffusion.activations import fast
 
 
 def sinusoidal_embedding(n_steps: int, dimension: int) -> th.Tensor:
@@ -24,14 +25,6 @@ def sinusoidal_embedding(n_steps: int, dimension: int) -> th.Tensor:
     frequency = th.exp(th.arange(half) * (-math.log(10_000) / (half - 1)))
     angle = th.arange(n_steps).unsqueeze(1) * frequency
     return th.cat([angle.sin(), angle.cos()], dim=1)
-
-
-def in_place(activation_fn: type[nn.Module]) -> Callable[[], nn.Module]:
-    """
-    :param activation_fn: Class of an activation
-    :return: Makes one that writes over its input where that is safe: half of the memory, which then stays in the cache
-    """
-    return partial(nn.ReLU, inplace=True) if activation_fn is nn.ReLU else activation_fn
 
 
 class MLPDenoiser(nn.Module):
@@ -69,7 +62,7 @@ class MLPDenoiser(nn.Module):
         self.input_layer = nn.Linear(action_dim + time_embedding_dim + condition_dim, first)
         layers: list[nn.Module] = []
         for inputs, outputs in pairwise([first, *rest]):
-            layers += [in_place(activation_fn)(), nn.Linear(inputs, outputs)]
+            layers += [fast(activation_fn)(), nn.Linear(inputs, outputs)]
         self.network = nn.Sequential(*layers)
 
     def bind(self, condition: th.Tensor) -> Callable[[th.Tensor, int | th.Tensor], th.Tensor]:

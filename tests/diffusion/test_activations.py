@@ -1,0 +1,45 @@
+"""Fast activations compute what PyTorch's do."""
+
+import pytest
+import torch as th
+import torch.nn.functional as F
+from torch import nn
+
+from sb3_causalgdp.diffusion.activations import FastMish, fast
+from sb3_causalgdp.diffusion.denoisers import MLPDenoiser
+
+
+@pytest.mark.parametrize("dtype, tolerance", [(th.float32, 2e-6), (th.float64, 1e-14)])
+def test_mish_and_its_gradient_are_those_of_pytorch(dtype, tolerance):
+    x = th.linspace(-90.0, 90.0, 20_001, dtype=dtype, requires_grad=True)
+    ours, theirs = FastMish()(x), F.mish(x)
+    th.testing.assert_close(ours, theirs, rtol=tolerance, atol=tolerance)
+    gradient_of = [th.autograd.grad(y.square().sum(), x)[0] for y in (ours, theirs)]
+    th.testing.assert_close(*gradient_of, rtol=10 * tolerance, atol=10 * tolerance)
+
+
+def test_mish_without_gradients_leaves_its_input_alone():
+    x = th.randn(50)
+    before = x.clone()
+    with th.no_grad():
+        th.testing.assert_close(FastMish()(x), F.mish(before), rtol=1e-6, atol=1e-6)
+    th.testing.assert_close(x, before, rtol=0, atol=0)
+
+
+def test_mish_in_forward_mode():
+    x, tangent = th.randn(50, dtype=th.float64), th.randn(50, dtype=th.float64)
+    with th.no_grad():
+        pairs = [th.func.jvp(function, (x,), (tangent,)) for function in (FastMish(), F.mish)]
+    th.testing.assert_close(*pairs)
+
+
+def test_networks_of_the_user_s_mish_are_fast_and_keep_their_weights_names():
+    denoiser = MLPDenoiser(2, 3, 5, [8, 8], nn.Mish)
+    assert sum(type(layer) is FastMish for layer in denoiser.network) == 2
+    assert list(denoiser.network.state_dict()) == ["1.weight", "1.bias", "3.weight", "3.bias"]
+    assert isinstance(fast(nn.Mish)(), nn.Mish)
+
+
+def test_other_activations_are_themselves():
+    assert fast(nn.Tanh) is nn.Tanh
+    assert type(fast(nn.ReLU)()) is nn.ReLU
