@@ -533,9 +533,8 @@ class CausalGDPPolicy(BasePolicy):
         acting = self._numpy_acting(observation)
         if acting is not None:
             assert isinstance(observation, th.Tensor)
-            features = observation.float().flatten(1).numpy()
-            noise = self._candidate_noise(len(features), deterministic).numpy()
-            return th.as_tensor(acting(self, features, noise, self.is_guided))
+            noise = self._candidate_noise(len(observation), deterministic).numpy()
+            return th.as_tensor(acting(self, observation.float().flatten(1).numpy(), noise, self.is_guided))
         features = self.actor.features(observation)
         return self._act_in_torch(observation, features, self._candidate_noise(len(features), deterministic))
 
