@@ -175,7 +175,7 @@ class CausalGDP(OfflineToOnlineAlgorithm):
         eta: float = 1.0,
         denoising_weight: float = 0.05,
         actor_update: str = "one_step",
-        policy_delay: int = 1,
+        policy_delay: int = 2,
         world_model_delay: int = 2,
         max_q_backup: bool = False,
         max_grad_norm: float | None = None,

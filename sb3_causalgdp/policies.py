@@ -468,7 +468,8 @@ class CausalGDPPolicy(BasePolicy):
             state = state.detach().requires_grad_()
             features = state if self.has_image_state else self._features_of_state(state, self.critic_target.features_extractor)
             values = q_values(self.critic_target, features, action, networks)
-            (gradient,) = th.autograd.grad(th.cat(values, dim=1).amin(dim=1).sum(), state)
+            smallest = values[0] if len(values) == 1 else th.cat(values, dim=1).amin(dim=1)
+            (gradient,) = th.autograd.grad(smallest.sum(), state)
         return gradient
 
     # Guidance -----------------------------------------------------------------------------------------------------------

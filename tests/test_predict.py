@@ -22,6 +22,7 @@ KWARGS = {
     "learning_rate": 1e-2,
     "eta": 0.01,
     "denoising_weight": 1.0,
+    "policy_delay": 1,
     "n_action_candidates": 3,
     "causal_refresh_freq": 60,
     "seed": 0,

@@ -169,7 +169,7 @@ def test_number_of_critics(n_critics):
 
 @pytest.mark.parametrize("n_parameters", [0, 1])
 def test_gradients_are_bounded(n_parameters, monkeypatch):
-    model = learn(24, max_grad_norm=1e-3)
+    model = learn(24, max_grad_norm=1e-3, policy_delay=1)
     module = (model.actor, model.critic)[n_parameters]
     norms = []
     optimizer = module.optimizer
@@ -303,7 +303,7 @@ def test_with_n_step_returns_the_world_model_learns_from_single_steps(kwargs, n_
 
 
 def test_with_n_step_returns_the_guidance_asks_for_the_next_step(monkeypatch):
-    model = SpyingGDP("MlpPolicy", CountingEnv(), **{**KWARGS, "n_steps": 3})
+    model = SpyingGDP("MlpPolicy", CountingEnv(), **{**KWARGS, "n_steps": 3, "policy_delay": 1})
     model.learn(80, callback=guided_callback())
     asked = []
     make_guidance = model.policy.make_guidance

@@ -212,6 +212,8 @@ ARGUMENTS = {
     "eta": 0.5,
     "denoising_weight": 0.7,
     "actor_update": "chain",
+    "policy_delay": 3,
+    "world_model_delay": 4,
     "max_q_backup": True,
     "max_grad_norm": 3.0,
     "diffusion_steps": 3,

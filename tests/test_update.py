@@ -156,7 +156,7 @@ def test_every_gradient_step_of_a_draw_has_its_own_rows(monkeypatch):
 
 
 def test_logs_are_means_over_the_gradient_steps(monkeypatch):
-    model = trained_model()
+    model = trained_model(policy_delay=1)
     values = iter([1.0, 2.0, 6.0])
     original = model._update_actor
     monkeypatch.setattr(model, "_update_actor", lambda *args: {**original(*args), "q_loss": th.tensor(next(values))})

@@ -231,6 +231,9 @@ def study_arguments(task: str) -> dict[str, Any]:
         "learning_rate": ACTOR_LEARNING_RATE,
         "critic_learning_rate": CRITIC_LEARNING_RATE,
         "denoising_weight": 1.0,
+        # Updates are what is counted: each one trains all parts, as the peers' do
+        "policy_delay": 1,
+        "world_model_delay": 1,
         **(MAZE_ARGUMENTS if task in MAZE_TASKS else {}),
     }
 

@@ -46,6 +46,7 @@ def sample_causalgdp_params(
     trial.suggest_float("eta", 0.005, 5.0, log=True)
     trial.suggest_float("denoising_weight", 0.005, 1.0, log=True)
     trial.suggest_categorical("actor_update", ACTOR_UPDATES)
+    trial.suggest_int("policy_delay", 1, 3)
     trial.suggest_int("diffusion_steps", 2, 16, log=True)
     trial.suggest_int("n_action_candidates_pow", 0, 5)
     trial.suggest_float("exploration_noise", 0.05, 0.5, log=True)
