@@ -5,21 +5,11 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
+from small_models import SMALL
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_causalgdp import CausalGDP, CausalWorldModelCallback
-
-KWARGS = {
-    "learning_starts": 20,
-    "batch_size": 8,
-    "train_freq": 8,
-    "buffer_size": 1000,
-    "causal_refresh_freq": 60,
-    "seed": 0,
-    "device": "cpu",
-    "policy_kwargs": {"net_arch": [16], "world_model_net_arch": [16, 16]},
-}
 
 
 class FaultyEnv(gym.Env):
@@ -52,7 +42,7 @@ class FaultyEnv(gym.Env):
 
 
 def make(env="Pendulum-v1", policy="MlpPolicy", **kwargs):
-    return CausalGDP(policy, env, **{**KWARGS, **kwargs})
+    return CausalGDP(policy, env, **{**SMALL, **kwargs})
 
 
 # Spaces -----------------------------------------------------------------------------------------------------------------
@@ -182,7 +172,7 @@ def test_too_few_transitions_are_said_once_and_then_it_works():
 def test_an_unknown_name_is_refused_at_once_with_those_that_are_known(argument, accepted):
     kwargs = {argument: "no_such_thing"}
     if argument == "activation_fn":
-        kwargs = {"policy_kwargs": {**KWARGS["policy_kwargs"], **kwargs}}
+        kwargs = {"policy_kwargs": {**SMALL["policy_kwargs"], **kwargs}}
     with pytest.raises(ValueError, match="no_such_thing") as error:
         make(**kwargs)
     for name in accepted:

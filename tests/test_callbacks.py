@@ -6,6 +6,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
+from small_models import SMALL
 from stable_baselines3.common.callbacks import (
     BaseCallback,
     CallbackList,
@@ -21,17 +22,6 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from sb3_causalgdp import CausalGDP, CausalWorldModelCallback
 from sb3_causalgdp.causal import CausalGraph, StreamingMoments
 
-KWARGS = {
-    "learning_starts": 20,
-    "batch_size": 8,
-    "train_freq": 8,
-    "buffer_size": 1000,
-    "causal_refresh_freq": 60,
-    "seed": 0,
-    "device": "cpu",
-    "policy_kwargs": {"net_arch": [16], "world_model_net_arch": [16, 16]},
-}
-
 
 class RecordingCallback(CausalWorldModelCallback):
     """Keeps when it refreshed."""
@@ -46,7 +36,7 @@ class RecordingCallback(CausalWorldModelCallback):
 
 
 def make(env="Pendulum-v1", **kwargs):
-    return CausalGDP("MlpPolicy", env, **{**KWARGS, **kwargs})
+    return CausalGDP("MlpPolicy", env, **{**SMALL, **kwargs})
 
 
 @pytest.fixture

@@ -3,24 +3,15 @@ import io
 import numpy as np
 import pytest
 import torch as th
+from small_models import SMALL
 
 from sb3_causalgdp import CausalGDP, CausalWorldModelCallback
 
-KWARGS = {
-    "learning_starts": 20,
-    "batch_size": 8,
-    "train_freq": 8,
-    "buffer_size": 1000,
-    "causal_refresh_freq": 60,
-    "seed": 0,
-    "device": "cpu",
-    "policy_kwargs": {"net_arch": [16], "world_model_net_arch": [16, 16]},
-}
 MODULES = ("actor", "critic", "world_model")
 
 
 def make(**kwargs):
-    return CausalGDP("MlpPolicy", "Pendulum-v1", **{**KWARGS, **kwargs})
+    return CausalGDP("MlpPolicy", "Pendulum-v1", **{**SMALL, **kwargs})
 
 
 def learn(total_timesteps=80, **kwargs):
@@ -74,7 +65,7 @@ def test_rates_follow_the_progress_of_training():
         "critic_learning_rate": lambda progress: np.float64(2e-3) * progress,
         "world_model_learning_rate": lambda progress: 3e-3 * progress,
     }
-    model = SpyingGDP("MlpPolicy", "Pendulum-v1", **{**KWARGS, **schedules})
+    model = SpyingGDP("MlpPolicy", "Pendulum-v1", **{**SMALL, **schedules})
     model.learn(80, callback=CausalWorldModelCallback(min_transitions=40))
     assert [steps for steps, *_ in seen] == [24, 32, 40, 48, 56, 64, 72, 80]
     for steps, *now in seen:

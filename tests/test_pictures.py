@@ -8,22 +8,13 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 pytest.importorskip("matplotlib")
 from matplotlib.image import imread
+from small_models import SMALL
 
 from sb3_causalgdp import CausalGDP, CausalWorldModelCallback
 from sb3_causalgdp.diagnostics import guidance_divergence, step_divergences
 from sb3_causalgdp.pictures import CausalPicturesCallback, draw_transitions, plot_guidance_strength, policy_input
 
-KWARGS = {
-    "learning_starts": 20,
-    "batch_size": 8,
-    "train_freq": 8,
-    "buffer_size": 1000,
-    "causal_refresh_freq": 60,
-    "diffusion_steps": 3,
-    "seed": 0,
-    "device": "cpu",
-    "policy_kwargs": {"net_arch": [16], "world_model_net_arch": [16, 16]},
-}
+KWARGS = {**SMALL, "diffusion_steps": 3}
 NAMES = ("effects", "graph", "guidance")
 
 

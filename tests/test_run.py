@@ -5,22 +5,12 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
+from small_models import SMALL
 from stable_baselines3.common.buffers import NStepReplayBuffer
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise, VectorizedActionNoise
 
 from sb3_causalgdp import CausalGDP, CausalWorldModelCallback, MlpPolicy
-
-KWARGS = {
-    "learning_starts": 20,
-    "batch_size": 8,
-    "train_freq": 8,
-    "buffer_size": 1000,
-    "causal_refresh_freq": 60,
-    "seed": 0,
-    "device": "cpu",
-    "policy_kwargs": {"net_arch": [16], "world_model_net_arch": [16, 16]},
-}
 
 
 class CountingEnv(gym.Env):
@@ -55,7 +45,7 @@ def guided_callback():
 
 
 def learn(total_timesteps=80, env="Pendulum-v1", callback=None, **kwargs):
-    model = CausalGDP("MlpPolicy", env, **{**KWARGS, **kwargs})
+    model = CausalGDP("MlpPolicy", env, **{**SMALL, **kwargs})
     model.learn(total_timesteps, callback=callback or guided_callback())
     assert all(bool(th.isfinite(value).all()) for value in model.policy.state_dict().values())
     return model
@@ -83,7 +73,7 @@ def test_updates_after_each_episode():
 
 
 def test_no_updates_before_learning_starts():
-    model = CausalGDP("MlpPolicy", "Pendulum-v1", **{**KWARGS, "learning_starts": 50})
+    model = CausalGDP("MlpPolicy", "Pendulum-v1", **{**SMALL, "learning_starts": 50})
     before = parameters(model)
     model.learn(48)
     assert th.equal(parameters(model), before)
@@ -163,7 +153,7 @@ def test_every_variant_trains(kwargs):
 
 @pytest.mark.parametrize("n_critics", [1, 3])
 def test_number_of_critics(n_critics):
-    model = learn(policy_kwargs={**KWARGS["policy_kwargs"], "n_critics": n_critics})
+    model = learn(policy_kwargs={**SMALL["policy_kwargs"], "n_critics": n_critics})
     assert len(model.critic.q_networks) == len(model.critic_target.q_networks) == n_critics
 
 
@@ -188,7 +178,7 @@ def test_gradients_are_bounded(n_parameters, monkeypatch):
 
 @pytest.mark.parametrize("policy", ["MlpPolicy", MlpPolicy, type("OwnPolicy", (MlpPolicy,), {})])
 def test_the_policy_is_a_name_or_a_class(policy):
-    model = CausalGDP(policy, "Pendulum-v1", **KWARGS)
+    model = CausalGDP(policy, "Pendulum-v1", **SMALL)
     assert isinstance(model.policy, MlpPolicy if isinstance(policy, str) else policy)
 
 
@@ -221,7 +211,7 @@ def test_hidden_layers_of_actor_and_critics(net_arch, actor_arch, critic_arch):
 
 @pytest.mark.parametrize("activation_fn", ["tanh", "Tanh", th.nn.Tanh])
 def test_the_activation_is_a_name_or_a_class(activation_fn):
-    model = learn(24, policy_kwargs={**KWARGS["policy_kwargs"], "activation_fn": activation_fn})
+    model = learn(24, policy_kwargs={**SMALL["policy_kwargs"], "activation_fn": activation_fn})
     for network in (model.actor.denoiser.network, *model.critic.q_networks):
         assert any(isinstance(layer, th.nn.Tanh) for layer in network)
         assert not any(isinstance(layer, (th.nn.ReLU, th.nn.Mish)) for layer in network)
@@ -233,7 +223,7 @@ def test_the_activation_is_a_name_or_a_class(activation_fn):
 )
 def test_the_optimizer_is_the_one_asked_for(optimizer_class, optimizer_kwargs):
     policy_kwargs = {"optimizer_class": optimizer_class, "optimizer_kwargs": optimizer_kwargs}
-    model = learn(24, learning_rate=1e-4, policy_kwargs={**KWARGS["policy_kwargs"], **policy_kwargs})
+    model = learn(24, learning_rate=1e-4, policy_kwargs={**SMALL["policy_kwargs"], **policy_kwargs})
     for module in (model.actor, model.critic, model.world_model):
         assert type(module.optimizer) is optimizer_class
         for name, value in optimizer_kwargs.items():
@@ -273,7 +263,7 @@ N_STEP_BUFFERS = [
 @pytest.mark.parametrize("n_envs", [1, 2])
 def test_with_n_step_returns_the_world_model_learns_from_single_steps(kwargs, n_envs):
     env = make_vec_env(CountingEnv, n_envs=n_envs)
-    model = SpyingGDP("MlpPolicy", env, **{**KWARGS, "batch_size": 32, **kwargs})
+    model = SpyingGDP("MlpPolicy", env, **{**SMALL, "batch_size": 32, **kwargs})
     model.learn(80, callback=guided_callback())
     assert model.policy.is_guided
 
@@ -303,7 +293,7 @@ def test_with_n_step_returns_the_world_model_learns_from_single_steps(kwargs, n_
 
 
 def test_with_n_step_returns_the_guidance_asks_for_the_next_step(monkeypatch):
-    model = SpyingGDP("MlpPolicy", CountingEnv(), **{**KWARGS, "n_steps": 3, "policy_delay": 1})
+    model = SpyingGDP("MlpPolicy", CountingEnv(), **{**SMALL, "n_steps": 3, "policy_delay": 1})
     model.learn(80, callback=guided_callback())
     asked = []
     make_guidance = model.policy.make_guidance
@@ -327,7 +317,7 @@ def test_the_memory_efficient_buffer_gives_the_world_model_no_jumps_between_epis
         CountingEnv(),
         optimize_memory_usage=True,
         replay_buffer_kwargs={"handle_timeout_termination": False},
-        **{**KWARGS, "buffer_size": 50},
+        **{**SMALL, "buffer_size": 50},
     )
     statistics, rows = [], []
     update_statistics, update = model.world_model.update_statistics, model.causal_statistics.update
@@ -362,7 +352,7 @@ def test_the_same_seed_gives_the_same_training_and_another_seed_another(kwargs):
 
 def test_learning_in_two_parts_is_learning_at_once():
     """SB3 draws the environment's episodes and its random numbers on where it stopped."""
-    models = [CausalGDP("MlpPolicy", "Pendulum-v1", **KWARGS) for _ in range(2)]
+    models = [CausalGDP("MlpPolicy", "Pendulum-v1", **SMALL) for _ in range(2)]
     models[0].set_random_seed(3)
     models[0].learn(128, callback=guided_callback())
     models[1].set_random_seed(3)
