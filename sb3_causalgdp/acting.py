@@ -17,7 +17,7 @@ from threadpoolctl import ThreadpoolController
 from torch import nn
 
 from sb3_causalgdp.causal.world_model import MaskedBlocks, MaskedWorldModel
-from sb3_causalgdp.diffusion import MLPDenoiser
+from sb3_causalgdp.diffusion import GuidanceRule, MLPDenoiser, NoiseSchedule
 from sb3_causalgdp.diffusion.activations import fast
 from sb3_causalgdp.diffusion.samplers import transition_weights
 
@@ -61,9 +61,9 @@ ACTIVATIONS: dict[type[nn.Module], Activation] = {
 }
 
 
-def _clip(action: np.ndarray) -> np.ndarray:
+def _clip(values: np.ndarray, bound: float = 1.0) -> np.ndarray:
     # A third of the time of np.clip on a few numbers
-    return np.minimum(np.maximum(action, -1.0), 1.0)
+    return np.minimum(np.maximum(values, -bound), bound)
 
 
 Layer = tuple[np.ndarray, np.ndarray]
@@ -185,6 +185,8 @@ class _Critics:
         inputs = np.concatenate([state, action])
         passes = [self._forward(layers, inputs) for layers in self.networks]
         smallest = np.argmin(np.concatenate([values for values, _ in passes]), axis=0)
+        if len(set(smallest.tolist())) == 1:
+            return self._backward(self.networks[smallest[0]], passes[smallest[0]][1], len(state))
         gradient = np.empty_like(state)
         for index, (layers, (_, hidden)) in enumerate(zip(self.networks, passes, strict=True)):
             columns = smallest == index
@@ -255,12 +257,12 @@ class _WorldModel:
         change = np.minimum(arrays["change_variance"] / (state_std * state_std), 4.0)
         residual_std = np.maximum(np.sqrt((1.0 - gate) ** 2 + gate * change), 1e-4)
         standardised = (state - arrays["state_mean"]) / state_std
-        inputs = np.concatenate([np.clip(standardised, -bound, bound), action], axis=1)
+        inputs = np.concatenate([_clip(standardised, bound), action], axis=1)
         mask = np.concatenate([arrays["state_to_state"], arrays["action_to_state"]], axis=1)
         change, jacobian = self.transition.forward_and_jacobian(inputs, mask, n_states)
         next_standardised = gate * standardised + residual_std * change
         next_jacobian = residual_std[:, None, None] * jacobian
-        reward_inputs = np.concatenate([np.clip(next_standardised, -bound, bound), action], axis=1)
+        reward_inputs = np.concatenate([_clip(next_standardised, bound), action], axis=1)
         reward_mask = np.concatenate([arrays["state_to_reward"], arrays["action_to_reward"]])[None]
         reward, reward_gradient = self.reward.forward_and_jacobian(reward_inputs, reward_mask, 0)
         by_next_state = reward_gradient[0, :, :n_states] * (np.abs(next_standardised) <= bound)
@@ -274,6 +276,45 @@ class _WorldModel:
             "reward_std": np.exp(np.clip(arrays["reward_log_std"], lowest, highest)) * reward_scale,
             "reward_jacobian": reward_scale * total,
         }
+
+
+class _Rule:
+    """``GuidanceRule`` for a guidance that is linear in the clean action."""
+
+    def __init__(self, rule: GuidanceRule, schedule: NoiseSchedule, action_dim: int) -> None:
+        self.mode = rule.mode
+        self.identity = np.eye(action_dim, dtype=np.float32)
+        alpha_bar = np.array(schedule.alpha_bar_list, dtype=np.float32)[:, None, None, None]
+        self.noise = 1.0 - alpha_bar
+        scales = np.asarray(rule.scales, dtype=np.float32).reshape(-1, 1, 1, 1)
+        self.factor = scales * np.sqrt(self.noise * alpha_bar if rule.mode == "posterior" else self.noise)
+
+    def shift(self, best: np.ndarray, gradient: np.ndarray, curvature: np.ndarray) -> Callable[[np.ndarray, int], np.ndarray]:
+        """
+        What the guidance takes off the predicted noise, as ``guidance_shift`` finds it.
+
+        :param best: The action at which the guidance was taken, shape ``(batch, d)``
+        :param gradient: Shape ``(batch, d)``
+        :param curvature: Shape ``(batch, d, d)``
+        :return: Gives the shift of a clean action and a diffusion step, both of shape ``(d, batch)``
+        """
+        # The guidance at the clean action 0; the diffusion steps' factors are found for all of them at once
+        at_zero = gradient[:, :, None] + curvature @ best[:, :, None]
+        if self.mode == "normalized":
+            return lambda clean, step: self.factor[step, 0, 0] * _unit((at_zero - curvature @ clean.T[:, :, None])[:, :, 0]).T
+        if self.mode == "posterior":
+            systems = self.identity + self.noise * curvature
+            size = np.abs(systems).max(axis=(2, 3), keepdims=True)
+            systems += (8.0 * np.finfo(np.float32).eps) * size * self.identity
+            factors = self.factor * np.linalg.inv(systems)
+        else:
+            factors = self.factor * self.identity
+        slopes, offsets = factors @ curvature, factors @ at_zero
+        return lambda clean, step: (offsets[step] - slopes[step] @ clean.T[:, :, None])[:, :, 0].T
+
+
+def _unit(rows: np.ndarray) -> np.ndarray:
+    return rows / np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-8)
 
 
 class NumpyActing:
@@ -290,7 +331,8 @@ class NumpyActing:
         self.denoiser = _Denoiser(policy)
         self.critics = _Critics(policy)
         self.world_model = _WorldModel(policy.world_model)
-        self.rule = policy.guidance_rule
+        rule = policy.guidance_rule
+        self.rule = None if rule is None else _Rule(rule, policy.actor.schedule, policy.actor.action_dim)
         self._blas = ThreadpoolController().select(user_api="blas")
         self._modules = self._modules_of(policy)
         self._tensors = [tensor for module in self._modules for tensor in (*module.parameters(), *module.buffers())]
@@ -362,34 +404,9 @@ class NumpyActing:
         action = candidates.T[best]
         if not guided:
             return action
-        shift = self._shift(policy, action, *self._local_model(policy, features, action, time_part))
+        assert self.rule is not None
+        shift = self.rule.shift(action, *self._local_model(policy, features, action, time_part))
         return np.ascontiguousarray(self.denoiser.sample(bound, noise[:, :, best], shift).T)
-
-    def _shift(
-        self, policy: Policy, best: np.ndarray, gradient: np.ndarray, curvature: np.ndarray
-    ) -> Callable[[np.ndarray, int], np.ndarray]:
-        """What the linearised guidance adds to the clean action's estimate, divided by a factor: see ``guidance_shift``."""
-        rule, alpha_bar = self.rule, np.array(policy.actor.schedule.alpha_bar_list, dtype=best.dtype)
-        assert rule is not None
-        factor = np.asarray(rule.scales, dtype=best.dtype) * np.sqrt(1.0 - alpha_bar)
-        if rule.mode == "normalized":
-
-            def normalized_shift(clean: np.ndarray, step: int) -> np.ndarray:
-                direction = gradient - (curvature @ (clean.T - best)[:, :, None])[:, :, 0]
-                return (factor[step] * direction / np.maximum(np.linalg.norm(direction, axis=1, keepdims=True), 1e-8)).T
-
-            return normalized_shift
-        # Linear in the clean action: what the diffusion steps multiply and add is found for all of them at once
-        at_zero = (gradient + (curvature @ best[:, :, None])[:, :, 0])[:, :, None]
-        if rule.mode == "posterior":
-            systems = np.eye(best.shape[1], dtype=best.dtype) + (1.0 - alpha_bar)[:, None, None, None] * curvature
-            size = np.abs(systems).max(axis=(2, 3), keepdims=True)
-            systems += 8.0 * np.finfo(best.dtype).eps * size * np.eye(best.shape[1], dtype=best.dtype)
-            factors = (factor * np.sqrt(alpha_bar))[:, None, None, None] * np.linalg.inv(systems)
-        else:
-            factors = factor[:, None, None, None] * np.eye(best.shape[1], dtype=best.dtype)
-        slopes, offsets = factors @ curvature, factors @ at_zero
-        return lambda clean, step: (offsets[step] - slopes[step] @ clean.T[:, :, None])[:, :, 0].T
 
     def _local_model(
         self, policy: Policy, state: np.ndarray, action: np.ndarray, time_part: np.ndarray
