@@ -58,7 +58,8 @@ class CausalGDP(OfflineToOnlineAlgorithm):
     :param learning_rate: Learning rate of the actor, and of the critics unless ``critic_learning_rate`` is given; it can be a
         function of the current progress remaining (from 1 to 0)
     :param buffer_size: Size of the replay buffer
-    :param learning_starts: How many steps of the model to collect transitions for before learning starts
+    :param learning_starts: How many steps of the model to collect transitions for before learning starts, with random actions
+        or, after :meth:`pretrain`, the policy's
     :param batch_size: Minibatch size for each gradient update
     :param tau: The soft update coefficient ("Polyak update", between 0 and 1) of the target critics and of the actor's moving
         average

@@ -279,6 +279,18 @@ def test_nothing_is_reset_between_the_stages(model):
     assert model.offline_buffer.size() == N_ROWS and model.replay_buffer.size() == 4
 
 
+@pytest.mark.parametrize("pretrain_steps", [0, 2])
+def test_only_a_policy_that_was_not_pretrained_starts_with_random_actions(pretrain_steps, arrays, monkeypatch):
+    model = make(learning_starts=50).preload(arrays).pretrain(pretrain_steps)
+    drawn = []
+    sample = model.action_space.sample
+    monkeypatch.setattr(model.action_space, "sample", lambda: drawn.append(1) or sample())
+    n_updates = model._n_updates
+    model.learn(10)
+    assert len(drawn) == (0 if pretrain_steps else 10)
+    assert model._n_updates == n_updates
+
+
 def n_offline(model, batch_size=1000):
     """How many rows of a batch were preloaded, by their marked rewards."""
     model.offline_buffer.rewards[:] = 99.0

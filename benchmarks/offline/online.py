@@ -16,11 +16,11 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
-import numpy as np
 import pandas as pd
 import torch as th
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv
@@ -74,31 +74,47 @@ def fine_tune(
     arguments = {**study_arguments(task), **CAUSALGDP_METHODS[method], "learning_starts": 0, **(overrides or {})}
     model = CausalGDP("MlpPolicy", _make(task), seed=seed, device="cpu", **arguments)
     model.preload(dataset_id)
-    envs = DummyVecEnv([lambda: _make(task)] * min(episodes, 10))
-    rows, start = [], time.process_time()
-    for stage, total, train in (("offline", updates, model.pretrain), ("online", steps, _learn(model))):
-        done = 0
-        for until in np.linspace(0, total, evaluations + 1).astype(int).tolist()[1:]:
-            train(until - done)
-            done = until
-            envs.seed(EVALUATION_SEED)
-            returns, _ = evaluate_policy(model, envs, episodes, return_episode_rewards=True)
-            scores = normalized_score(task, returns).values
-            row = {"stage": stage, "count": done, "score": round(scores.mean(), 2), "std": round(scores.std(), 2)}
-            rows.append({**row, "episodes": len(scores), "cpu_seconds": round(time.process_time() - start, 1)})
-            print(json.dumps(rows[-1]), flush=True)
+    evaluate = _Evaluate(task, episodes)
+    for stage, total, train in (("offline", updates, model.pretrain), ("online", steps, model.learn)):
+        train(total, callback=evaluate.during(stage, max(1, total // evaluations)))
     model.save(scratch / "model")
-    return rows
+    return evaluate.rows
+
+
+class _Evaluate(BaseCallback):
+    """Scores every so many gradient updates or environment steps."""
+
+    def __init__(self, task: str, episodes: int) -> None:
+        super().__init__()
+        self.task = task
+        self.episodes = episodes
+        self.envs = DummyVecEnv([lambda: _make(task)] * min(episodes, 10))
+        self.rows: list[dict[str, Any]] = []
+        self.start = time.process_time()
+
+    def during(self, stage: str, period: int) -> "_Evaluate":
+        self.stage, self.period = stage, period
+        return self
+
+    def _on_step(self) -> bool:
+        if self.num_timesteps % self.period == 0:
+            state = th.get_rng_state()
+            self.envs.seed(EVALUATION_SEED)
+            returns, _ = evaluate_policy(self.model, self.envs, self.episodes, return_episode_rewards=True)
+            th.set_rng_state(state)
+            scores = normalized_score(self.task, returns).values
+            row = {"stage": self.stage, "count": self.num_timesteps, "score": scores.mean(), "std": scores.std()}
+            rounded = {name: value if isinstance(value, (str, int)) else round(float(value), 2) for name, value in row.items()}
+            seconds = round(time.process_time() - self.start, 1)
+            self.rows.append({**rounded, "episodes": len(scores), "cpu_seconds": seconds})
+            print(json.dumps(self.rows[-1]), flush=True)
+        return True
 
 
 def _make(task: str) -> gym.Env[Any, Any]:
     if task in MAZE_TASKS:
         return Monitor(gym.make(environment_id(task), disable_env_checker=True))
     return MUJOCO_TASKS[task.partition("-")[0]].make()
-
-
-def _learn(model: CausalGDP) -> Any:
-    return lambda steps: model.learn(steps, reset_num_timesteps=False)
 
 
 def draw(table: pd.DataFrame, path: Path) -> None:

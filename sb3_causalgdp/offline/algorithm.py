@@ -8,8 +8,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any, TypeVar
 
+import numpy as np
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback, ProgressBarCallback
+from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import MaybeCallback, Schedule
@@ -295,6 +297,12 @@ class OfflineToOnlineAlgorithm(OffPolicyAlgorithm):
         if self.offline_buffer is not None and self.offline_buffer is self.replay_buffer:
             self.replay_buffer = self._new_buffer(self.buffer_size)
         return super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
+
+    def _sample_action(
+        self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
+    ) -> tuple[np.ndarray, np.ndarray]:
+        # A pretrained policy collects the transitions that learning starts with: it knows better than to act at random
+        return super()._sample_action(0 if self._n_pretrain_steps > 0 else learning_starts, action_noise, n_envs)
 
     def _n_offline(self, batch_size: int) -> int:
         if self.offline_buffer is None:
