@@ -54,7 +54,7 @@ def fine_tune(
     overrides: dict[str, Any] | None = None,
 ) -> list[dict[str, Any]]:
     """
-    Pretrain and fine-tune one model; each batch of the online stage is half offline data.
+    Pretrain and fine-tune one model; at first batches are all offline data, in the end half of them.
 
     :param task: One of ``TASKS``; datasets of MuJoCo tasks have to be there
     :param method: One of ``CAUSALGDP_METHODS``
@@ -71,7 +71,13 @@ def fine_tune(
     th.set_num_threads(1)
     is_maze = task in MAZE_TASKS
     dataset_id = ensure_dataset(task, dataset_steps) if is_maze else f"sb3_causalgdp/{task}-v0"
-    arguments = {**study_arguments(task), **CAUSALGDP_METHODS[method], "learning_starts": 0, **(overrides or {})}
+    arguments = {
+        **study_arguments(task),
+        **CAUSALGDP_METHODS[method],
+        "learning_starts": 0,
+        "offline_fraction": from_all_to_half,
+    }
+    arguments.update(overrides or {})
     model = CausalGDP("MlpPolicy", _make(task), seed=seed, device="cpu", **arguments)
     model.preload(dataset_id)
     evaluate = _Evaluate(task, episodes)
@@ -79,6 +85,16 @@ def fine_tune(
         train(total, callback=evaluate.during(stage, max(1, total // evaluations)))
     model.save(scratch / "model")
     return evaluate.rows
+
+
+def from_all_to_half(progress_remaining: float) -> float:
+    """
+    Share of offline data: with a half from the start, a few hundred transitions are half of what the critics see.
+
+    :param progress_remaining: From 1 to 0
+    :return: From 1 to 0.5
+    """
+    return 0.5 + 0.5 * progress_remaining
 
 
 class _Evaluate(BaseCallback):
