@@ -620,6 +620,10 @@ class CausalGDP(OfflineToOnlineAlgorithm):
         if guided:
             rule = self.policy.guidance_rule
             state, next_state = self.policy.causal_state(observations), self.policy.causal_state(transitions.next_observations)
+            if self.optimize_memory_usage:
+                # In place of an episode's last observation, which this buffer does not keep
+                predicted = self.world_model.predict_next_state(state, transitions.actions)[0].detach()
+                next_state = th.where(transitions.dones > 0.0, predicted, next_state)
             guidance = self.policy.make_guidance(state, next_state, next_actions, climbed)
         denoising, clean_actions = denoising_loss(
             self.actor.denoiser, self.actor.schedule, features, transitions.actions, guidance, rule

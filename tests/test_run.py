@@ -311,14 +311,34 @@ def test_with_n_step_returns_the_guidance_asks_for_the_next_step(monkeypatch):
         th.testing.assert_close(next_action, next_state / 1000.0)
 
 
-def test_the_memory_efficient_buffer_gives_the_world_model_no_jumps_between_episodes(monkeypatch):
-    model = CausalGDP(
+def memory_efficient():
+    return CausalGDP(
         "MlpPolicy",
         CountingEnv(),
         optimize_memory_usage=True,
         replay_buffer_kwargs={"handle_timeout_termination": False},
         **{**SMALL, "buffer_size": 50},
     )
+
+
+def test_the_memory_efficient_buffer_gives_the_guidance_a_predicted_end_of_each_episode(monkeypatch):
+    model = memory_efficient().learn(160, callback=guided_callback())
+    asked = []
+    make_guidance = model.policy.make_guidance
+    monkeypatch.setattr(model.policy, "make_guidance", lambda *args: asked.append(args) or make_guidance(*args))
+    data = model.replay_buffer.sample(200)
+    model._actor_losses(data, data.actions, 0, True)
+    ((state, next_state, _, _),) = asked
+    ended = data.dones.flatten() > 0.0
+    assert 0 < ended.sum() < 200
+    assert th.equal(next_state[~ended], (state + th.tensor([1.0, 0.0]))[~ended])
+    predicted, _ = model.world_model.predict_next_state(state, data.actions)
+    th.testing.assert_close(next_state[ended], predicted[ended].detach())
+    assert not next_state.requires_grad
+
+
+def test_the_memory_efficient_buffer_gives_the_world_model_no_jumps_between_episodes(monkeypatch):
+    model = memory_efficient()
     statistics, rows = [], []
     update_statistics, update = model.world_model.update_statistics, model.causal_statistics.update
     monkeypatch.setattr(
