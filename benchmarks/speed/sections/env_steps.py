@@ -5,13 +5,14 @@ from typing import Any
 from benchmarks.speed import contestants, learning
 from benchmarks.speed.benchmark import HALF_CHEETAH, Benchmark
 from benchmarks.speed.client import Contestant, median_ratio
-from benchmarks.speed.contestants import DEFAULT, DIFFUSION_QL, MISH_NETS, SAC, SAME_NETS
+from benchmarks.speed.contestants import AUTHORS, DEFAULT, DIFFUSION_QL, MISH_NETS, SAC, SAME_NETS
 from benchmarks.speed.results import Results, Verdict
 
 COLUMNS = ("group", "contestant", "steps per CPU second", "ms per step", "ms per refresh", "share of refreshes", "status")
 SAME = f"{DEFAULT}, ReLU 3x256"
 ONE_ENV, MANY_ENVS = "CausalGDP, default, 1 environment", "CausalGDP, default, 16 environments"
 TEN_STEPS = "CausalGDP, K=10, Mish 3x256"
+TEN_STEPS_AS_AUTHORS = "CausalGDP, K=10, Mish 2x256"  # the layers of the authors' loop
 STARTS = 2_000  # two causal graphs
 
 
@@ -31,6 +32,12 @@ def run(benchmark: Benchmark) -> None:
         ],
         "K=10": [
             contestants.causalgdp(TEN_STEPS, diffusion_steps=10, policy_kwargs=MISH_NETS, **ours),
+            contestants.causalgdp(
+                TEN_STEPS_AS_AUTHORS,
+                diffusion_steps=10,
+                policy_kwargs={"net_arch": [256, 256], "activation_fn": "mish"},
+                **ours,
+            ),
             *benchmark.diffusion_ql(10),
             *benchmark.authors(),
         ],
@@ -45,6 +52,9 @@ def run(benchmark: Benchmark) -> None:
         _verdict(results, "env steps: CausalGDP default, guided, vs SB3 SAC 3x256", DEFAULT, SAC, 1.0, 1.4),
         _verdict(results, "env steps: CausalGDP default with 3x256, guided, vs SB3 SAC 3x256", SAME, SAC, 1.0, 1.4),
         _verdict(results, "env steps, K=10: CausalGDP Mish 3x256 vs Diffusion-QL in a plain loop", TEN_STEPS, DIFFUSION_QL),
+        _verdict(
+            results, "env steps, K=10: CausalGDP Mish 2x256 vs its authors' loop", TEN_STEPS_AS_AUTHORS, AUTHORS, 2.2, 3.0
+        ),
         _verdict(results, "env steps: 16 environments vs 1, equal updates per step", MANY_ENVS, ONE_ENV, 1.3, 2.0),
     ]
     results.write(COLUMNS)
