@@ -8,6 +8,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 from importlib.metadata import version
 from pathlib import Path
 
@@ -224,12 +225,21 @@ def test_interrupted_training_leaves_a_model_that_loads(folder):
     env = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), "OMP_NUM_THREADS": "1"}
     output = []
     with subprocess.Popen(
-        [*command, *parameters], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=env
+        [*command, *parameters],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        env=env,
+        # A shell's background jobs, as these tests may be one, hand down a SIGINT that is ignored
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     ) as process:
+        give_up = threading.Timer(600, process.kill)
+        give_up.start()
         for line in process.stdout:
             output.append(line)
             if "at step 120" in line:
                 process.send_signal(signal.SIGINT)
+        give_up.cancel()
     assert process.returncode == 0, "".join(output)
     model = CausalGDP.load("logs/causalgdp/Pendulum-v1_1/Pendulum-v1.zip", device="cpu")
     assert 120 <= model.num_timesteps < 1_000_000
