@@ -153,6 +153,7 @@ def draw(table: pd.DataFrame, path: Path) -> None:
             axes.plot(curves.index, curves.mean(axis=1), color=colour, linewidth=2, marker="o", markersize=3, label=method)
         axes.axvline(length, color="black", linestyle="--", linewidth=1)
         axes.set(title=task, xlabel="gradient updates, then environment steps", ylabel="D4RL's normalised score")
+        axes.set_ylim(bottom=min(0.0, axes.get_ylim()[0]))  # a tenth of a point is no fall
         axes.grid(alpha=0.3)
         axes.legend(frameon=False)
     save_figure(figure, path)
