@@ -84,7 +84,7 @@ def _linear_layers(modules: Any, activation: type[nn.Module]) -> list[Layer] | N
     for module in modules:
         if isinstance(module, nn.Linear) and module.bias is not None:
             layers.append(_layer(module))
-        elif type(module) is not activation and type(module) is not fast(activation):
+        elif type(module) not in (activation, fast(activation)):
             return None
     return layers
 

@@ -335,12 +335,12 @@ class CausalGDP(OfflineToOnlineAlgorithm):
             raise ValueError(f"causal_refresh_freq must be at least 1 environment step, got {self.causal_refresh_freq!r}")
         for name in ("policy_delay", "world_model_delay"):
             delay = getattr(self, name)
-            if not isinstance(delay, int) or isinstance(delay, bool) or delay < 1:
+            if not _is_count(delay):
                 raise ValueError(f"{name} must be an integer of at least 1 gradient step, got {delay!r}")
         if self.actor_update not in ACTOR_UPDATES:
             raise ValueError(f"Unknown actor_update {self.actor_update!r}: it must be one of {list(ACTOR_UPDATES)}")
         threads = self.torch_threads
-        if not (threads in (None, "auto") or (isinstance(threads, int) and not isinstance(threads, bool) and threads >= 1)):
+        if not (threads in (None, "auto") or _is_count(threads)):
             raise ValueError(f"torch_threads must be 'auto', None or an integer of at least 1, got {threads!r}")
         if self.max_grad_norm is not None and self.max_grad_norm <= 0.0:
             raise ValueError(f"max_grad_norm must be positive or None, got {self.max_grad_norm!r}")
@@ -622,7 +622,8 @@ class CausalGDP(OfflineToOnlineAlgorithm):
             state, next_state = self.policy.causal_state(observations), self.policy.causal_state(transitions.next_observations)
             if self.optimize_memory_usage:
                 # In place of an episode's last observation, which this buffer does not keep
-                predicted = self.world_model.predict_next_state(state, transitions.actions)[0].detach()
+                with th.no_grad():
+                    predicted, _ = self.world_model.predict_next_state(state, transitions.actions)
                 next_state = th.where(transitions.dones > 0.0, predicted, next_state)
             guidance = self.policy.make_guidance(state, next_state, next_actions, climbed)
         denoising, clean_actions = denoising_loss(
@@ -757,6 +758,10 @@ class CausalGDP(OfflineToOnlineAlgorithm):
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         state_dicts = ["policy", "actor.optimizer", "critic.optimizer", "world_model.optimizer"]
         return state_dicts, []
+
+
+def _is_count(value: Any) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and value >= 1
 
 
 def _optimizer_of(module: th.nn.Module) -> th.optim.Optimizer:

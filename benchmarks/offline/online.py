@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+import numpy as np
 import pandas as pd
 import torch as th
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -82,7 +83,8 @@ def fine_tune(
     model.preload(dataset_id)
     evaluate = _Evaluate(task, episodes)
     for stage, total, train in (("offline", updates, model.pretrain), ("online", steps, model.learn)):
-        train(total, callback=evaluate.during(stage, max(1, total // evaluations)))
+        counts = np.linspace(0, total, evaluations + 1).astype(int).tolist()[1:]
+        train(total, callback=evaluate.at(stage, counts))
     model.save(scratch / "model")
     return evaluate.rows
 
@@ -98,7 +100,7 @@ def from_all_to_half(progress_remaining: float) -> float:
 
 
 class _Evaluate(BaseCallback):
-    """Scores every so many gradient updates or environment steps."""
+    """Scores after given numbers of gradient updates or environment steps."""
 
     def __init__(self, task: str, episodes: int) -> None:
         super().__init__()
@@ -108,21 +110,24 @@ class _Evaluate(BaseCallback):
         self.rows: list[dict[str, Any]] = []
         self.start = time.process_time()
 
-    def during(self, stage: str, period: int) -> "_Evaluate":
-        self.stage, self.period = stage, period
+    def at(self, stage: str, counts: list[int]) -> "_Evaluate":
+        self.stage, self.counts = stage, counts
         return self
 
     def _on_step(self) -> bool:
-        if self.num_timesteps % self.period == 0:
+        if self.num_timesteps in self.counts:
             state = th.get_rng_state()
             self.envs.seed(EVALUATION_SEED)
             returns, _ = evaluate_policy(self.model, self.envs, self.episodes, return_episode_rewards=True)
             th.set_rng_state(state)
             scores = normalized_score(self.task, returns).values
-            row = {"stage": self.stage, "count": self.num_timesteps, "score": scores.mean(), "std": scores.std()}
-            rounded = {name: value if isinstance(value, (str, int)) else round(float(value), 2) for name, value in row.items()}
-            seconds = round(time.process_time() - self.start, 1)
-            self.rows.append({**rounded, "episodes": len(scores), "cpu_seconds": seconds})
+            row = {
+                "stage": self.stage,
+                "count": self.num_timesteps,
+                "score": round(scores.mean(), 2),
+                "std": round(scores.std(), 2),
+            }
+            self.rows.append({**row, "episodes": len(scores), "cpu_seconds": round(time.process_time() - self.start, 1)})
             print(json.dumps(self.rows[-1]), flush=True)
         return True
 

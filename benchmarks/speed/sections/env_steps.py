@@ -35,7 +35,7 @@ def run(benchmark: Benchmark) -> None:
             contestants.causalgdp(
                 TEN_STEPS_AS_AUTHORS,
                 diffusion_steps=10,
-                policy_kwargs={"net_arch": [256, 256], "activation_fn": "mish"},
+                policy_kwargs={**MISH_NETS, "net_arch": [256, 256]},
                 **ours,
             ),
             *benchmark.diffusion_ql(10),
