@@ -399,7 +399,7 @@ class CausalGDPPolicy(BasePolicy):
         """
         modules = (self.actor, self.critic, self.world_model)
         if all(module.training == mode for module in (self, *modules)):
-            return  # every prediction asks for it, and visiting all layers would take a fifth of its time
+            return  # every prediction asks for it, and visiting all layers would take a sixth of its time
         for module in modules:
             module.train(mode)
         self.training = mode
