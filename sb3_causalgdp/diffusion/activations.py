@@ -53,7 +53,7 @@ class _MishFunction(th.autograd.Function):
 
 
 class FastMish(nn.Mish):
-    """Mish to rounding, on a CPU in TIMES of PyTorch's time."""
+    """Mish to rounding, on a CPU in less than half of PyTorch's time, or two thirds with gradients."""
 
     def forward(self, x: th.Tensor) -> th.Tensor:
         if th.compiler.is_compiling():
