@@ -1,8 +1,6 @@
 """CausalGDP: what happens when."""
 
 import io
-import math
-import os
 import pathlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -31,8 +29,10 @@ from sb3_causalgdp.causal import (
     make_discovery,
     make_statistics,
 )
+from sb3_causalgdp.causal.graph import replaced_when_done
 from sb3_causalgdp.causal.interventions import ActionRule
 from sb3_causalgdp.causal.world_model import MaskedWorldModel
+from sb3_causalgdp.checks import check_at_least_zero, is_count
 from sb3_causalgdp.losses import critic_loss, denoising_loss, q_loss, td_target, world_model_loss
 from sb3_causalgdp.offline.algorithm import OfflineToOnlineAlgorithm, callback_list
 from sb3_causalgdp.offline.replay import concatenate_samples, split_sample
@@ -327,20 +327,17 @@ class CausalGDP(OfflineToOnlineAlgorithm):
             self._fed_marks = []
 
     def _check_arguments(self) -> None:
-        for name in ("eta", "denoising_weight"):
-            value = getattr(self, name)
-            if not 0.0 <= value < math.inf:
-                raise ValueError(f"{name} must be a finite number of at least 0, got {value!r}")
+        check_at_least_zero(eta=self.eta, denoising_weight=self.denoising_weight)
         if self.causal_refresh_freq < 1:
             raise ValueError(f"causal_refresh_freq must be at least 1 environment step, got {self.causal_refresh_freq!r}")
         for name in ("policy_delay", "world_model_delay"):
             delay = getattr(self, name)
-            if not _is_count(delay):
+            if not is_count(delay):
                 raise ValueError(f"{name} must be an integer of at least 1 gradient step, got {delay!r}")
         if self.actor_update not in ACTOR_UPDATES:
             raise ValueError(f"Unknown actor_update {self.actor_update!r}: it must be one of {list(ACTOR_UPDATES)}")
         threads = self.torch_threads
-        if not (threads in (None, "auto") or _is_count(threads)):
+        if not (threads in (None, "auto") or is_count(threads)):
             raise ValueError(f"torch_threads must be 'auto', None or an integer of at least 1, got {threads!r}")
         if self.max_grad_norm is not None and self.max_grad_norm <= 0.0:
             raise ValueError(f"max_grad_norm must be positive or None, got {self.max_grad_norm!r}")
@@ -364,11 +361,11 @@ class CausalGDP(OfflineToOnlineAlgorithm):
         rate = self.critic_learning_rate
         self.critic_lr_schedule = None if rate is None else FloatSchedule(rate)
         self.world_model_lr_schedule = FloatSchedule(self.world_model_learning_rate)
-        schedules = (self.lr_schedule, self.critic_lr_schedule, self.world_model_lr_schedule)
-        names = ("learning_rate", "critic_learning_rate", "world_model_learning_rate")
-        for name, schedule in zip(names, schedules, strict=True):
-            if schedule is not None and not 0.0 <= schedule(1.0) < math.inf:
-                raise ValueError(f"{name} must be a finite number of at least 0, got {schedule(1.0)!r}")
+        check_at_least_zero(
+            learning_rate=self.lr_schedule(1.0),
+            critic_learning_rate=(self.critic_lr_schedule or self.lr_schedule)(1.0),
+            world_model_learning_rate=self.world_model_lr_schedule(1.0),
+        )
 
     def _update_learning_rates(self) -> None:
         self._update_learning_rate(self.actor.optimizer)
@@ -505,15 +502,20 @@ class CausalGDP(OfflineToOnlineAlgorithm):
 
     def _gradient_steps(self, gradient_steps: int, batch_size: int) -> dict[str, list[th.Tensor]]:
         losses: dict[str, list[th.Tensor]] = {}
-        for replay_data, one_step in self._batches(gradient_steps, batch_size):
+        for replay_data in self._batches(gradient_steps, batch_size):
             self._n_updates += 1
+            trains_world_model = self._n_updates % self.world_model_delay == 0
+            trains_actor = self._n_updates % self.policy_delay == 0
+            one_step = replay_data
+            if isinstance(self.replay_buffer, NStepReplayBuffer) and (trains_world_model or trains_actor):
+                one_step = self._sample(batch_size, one_step=True)
             if self.compile:
                 # What a CUDA graph returned is overwritten from here on
                 th.compiler.cudagraph_mark_step_begin()
             next_actions, step_losses = self._update_critics(replay_data)
-            if self._n_updates % self.world_model_delay == 0:
+            if trains_world_model:
                 step_losses.update(self._update_world_model(one_step))
-            if self._n_updates % self.policy_delay == 0:
+            if trains_actor:
                 if one_step is not replay_data:
                     with th.no_grad():
                         next_actions = self.actor_target.sample(self.actor_target.features(one_step.next_observations))
@@ -528,20 +530,14 @@ class CausalGDP(OfflineToOnlineAlgorithm):
             return self.torch_threads  # type: ignore[return-value]
         return None if self.policy.has_image_state else 1
 
-    def _batches(self, gradient_steps: int, batch_size: int) -> Iterator[tuple[Any, Any]]:
-        """The batches of each gradient step, for the critics and for the one-step models; drawn many at a time."""
+    def _batches(self, gradient_steps: int, batch_size: int) -> Iterator[Any]:
+        """The batch of each gradient step; drawn many at a time."""
         most_at_once = 1 if self.policy.has_image_state else max(1, self.MOST_ROWS_PER_DRAW // batch_size)
         done = 0
         while done < gradient_steps:
             n_batches = min(most_at_once, gradient_steps - done)
-            batches = one_step = self._draw_batches(n_batches, batch_size)
-            if isinstance(self.replay_buffer, NStepReplayBuffer):
-                one_step = self._draw_batches(n_batches, batch_size, one_step=True)
-            yield from zip(batches, one_step, strict=True)
+            yield from split_sample(self._sample(n_batches * batch_size), n_batches)
             done += n_batches
-
-    def _draw_batches(self, n_batches: int, batch_size: int, one_step: bool = False) -> list[Any]:
-        return split_sample(self._sample(n_batches * batch_size, one_step), n_batches)
 
     def _sample(self, batch_size: int, one_step: bool = False) -> Any:
         """A batch from the replay buffer, from the preloaded transitions, or from both."""
@@ -731,12 +727,8 @@ class CausalGDP(OfflineToOnlineAlgorithm):
         target = pathlib.Path(path)
         if target.suffix == "":
             target = pathlib.Path(f"{path}.zip")
-        temporary = target.with_name(f".{os.getpid()}.{target.name}")
-        try:
+        with replaced_when_done(target) as temporary:
             super().save(temporary, exclude, include)
-            os.replace(temporary, target)
-        finally:
-            temporary.unlink(missing_ok=True)
 
     def _excluded_save_params(self) -> list[str]:
         return super()._excluded_save_params() + [  # noqa: RUF005
@@ -758,10 +750,6 @@ class CausalGDP(OfflineToOnlineAlgorithm):
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         state_dicts = ["policy", "actor.optimizer", "critic.optimizer", "world_model.optimizer"]
         return state_dicts, []
-
-
-def _is_count(value: Any) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool) and value >= 1
 
 
 def _optimizer_of(module: th.nn.Module) -> th.optim.Optimizer:

@@ -1,6 +1,5 @@
 """Diffusion actor, double critics, their targets and the causal world model, as one SB3 policy."""
 
-import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -21,6 +20,7 @@ from torch import nn
 from sb3_causalgdp.acting import NumpyActing
 from sb3_causalgdp.causal import CausalGuidance, LinearisedGuidance, MaskedWorldModel, ReturnTarget, RewardTarget
 from sb3_causalgdp.causal.guidance import OutcomeTarget
+from sb3_causalgdp.checks import check_at_least_zero
 from sb3_causalgdp.diffusion import Guidance, GuidanceRule, MLPDenoiser, NoiseSchedule, sample
 from sb3_causalgdp.diffusion.activations import fast
 from sb3_causalgdp.diffusion.samplers import check_sampler
@@ -263,13 +263,11 @@ class CausalGDPPolicy(BasePolicy):
             raise ValueError(f"Unknown guidance_target {guidance_target!r}: it must be one of {list(GUIDANCE_TARGETS)}")
         if n_action_candidates < 1:
             raise ValueError(f"n_action_candidates must be at least 1, got {n_action_candidates!r}")
-        for name, value in (
-            ("exploration_noise", exploration_noise),
-            ("state_guidance_scale", state_guidance_scale),
-            ("outcome_guidance_scale", outcome_guidance_scale),
-        ):
-            if not 0.0 <= value < math.inf:
-                raise ValueError(f"{name} must be a finite number of at least 0, got {value!r}")
+        check_at_least_zero(
+            exploration_noise=exploration_noise,
+            state_guidance_scale=state_guidance_scale,
+            outcome_guidance_scale=outcome_guidance_scale,
+        )
         self.guidance_rule = None if guidance is None else GuidanceRule(guidance, guidance_covariance, guidance_scale)
         self.guidance_kwargs: dict[str, Any] = {
             "guidance": guidance,

@@ -6,6 +6,7 @@ from typing import NamedTuple, Protocol
 import torch as th
 
 from sb3_causalgdp.causal.world_model import ActionResponse, MaskedWorldModel
+from sb3_causalgdp.checks import check_at_least_zero
 
 
 class OutcomeTerm(NamedTuple):
@@ -89,9 +90,7 @@ class CausalGuidance:
         state_scale: float = 1.0,
         outcome_scale: float = 1.0,
     ) -> None:
-        for name, value in (("state_scale", state_scale), ("outcome_scale", outcome_scale)):
-            if not 0.0 <= value < float("inf"):
-                raise ValueError(f"{name} must be a finite number of at least 0, got {value!r}")
+        check_at_least_zero(state_scale=state_scale, outcome_scale=outcome_scale)
         self.world_model = world_model
         self.state = state
         self.next_state = next_state
