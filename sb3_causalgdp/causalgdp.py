@@ -626,9 +626,12 @@ class CausalGDP(OfflineToOnlineAlgorithm):
             self.actor.denoiser, self.actor.schedule, features, transitions.actions, guidance, rule
         )
         actions = clean_actions if self.actor_update == "one_step" else self.actor.sample(features)
+        other = (climbed + 1) % len(self.critic.q_networks)
         with th.no_grad():
             critic_features = self.critic.extract_features(observations, self.critic.features_extractor)
-        return denoising, q_loss(q_values(self.critic, critic_features, actions), climbed)
+            (scale,) = q_values(self.critic, critic_features, actions, slice(other, other + 1))
+        (values,) = q_values(self.critic, critic_features, actions, slice(climbed, climbed + 1))
+        return denoising, q_loss(values, scale)
 
     def _optimize(self, module: th.nn.Module, loss: th.Tensor) -> None:
         optimizer = _optimizer_of(module)

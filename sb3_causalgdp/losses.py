@@ -75,16 +75,15 @@ def denoising_loss(
     return F.mse_loss(predicted, noise), clean_action
 
 
-def q_loss(q_values: Sequence[th.Tensor], index: int) -> th.Tensor:
+def q_loss(values: th.Tensor, scale: th.Tensor) -> th.Tensor:
     """
     ``-E[Q_i(s, G_theta(s; z))] / E|Q_j|``: one critic is climbed, another one sets the scale (Diffusion-QL).
 
-    :param q_values: Q-values of each critic at the actor's actions, each of shape ``(batch, 1)``
-    :param index: The critic i to climb; j is the next one
+    :param values: Q_i at the actor's actions, shape ``(batch, 1)``
+    :param scale: Q_j at the same actions, shape ``(batch, 1)``; no gradient flows through it
     :return: Scalar
     """
-    scale = q_values[(index + 1) % len(q_values)].detach().abs().mean().clamp(min=1e-6)
-    return -q_values[index].mean() / scale
+    return -values.mean() / scale.detach().abs().mean().clamp(min=1e-6)
 
 
 def world_model_loss(
