@@ -138,14 +138,23 @@ class _Denoiser:
         return hidden
 
     def sample(
-        self, bound: np.ndarray, noise: np.ndarray, shift: Callable[[np.ndarray, int], np.ndarray] | None = None
+        self,
+        bound: np.ndarray,
+        noise: np.ndarray,
+        first_prediction: np.ndarray | None = None,
+        shift: Callable[[np.ndarray, int], np.ndarray] | None = None,
     ) -> np.ndarray:
-        """The chain of :func:`sb3_causalgdp.diffusion.sample`; noise of shape ``(K, d, batch)``, actions ``(d, batch)``."""
+        """
+        The chain of :func:`sb3_causalgdp.diffusion.sample`; noise of shape ``(K, d, batch)``, actions ``(d, batch)``. What the
+        denoiser says of the start does not depend on the guidance, so a second chain need not ask again.
+        """
         action, n_steps = noise[0], len(noise)
         for position, step in enumerate(reversed(range(n_steps))):
             alpha_bar = self.schedule.alpha_bar_list[step]
             spread, signal = (1.0 - alpha_bar) ** 0.5, alpha_bar**0.5
-            clean = (action - spread * self.predict_noise(action, bound[step])) / signal
+            is_known = position == 0 and first_prediction is not None
+            predicted = first_prediction if is_known else self.predict_noise(action, bound[step])
+            clean = (action - spread * predicted) / signal
             if shift is not None:
                 clean = clean + (spread / signal) * shift(_clip(clean), step)
             clean = _clip(clean)
@@ -306,10 +315,10 @@ class _Rule:
             systems = self.identity + self.noise * curvature
             size = np.abs(systems).max(axis=(2, 3), keepdims=True)
             systems += (8.0 * np.finfo(np.float32).eps) * size * self.identity
-            factors = self.factor * np.linalg.inv(systems)
+            both = self.factor * np.linalg.solve(systems, np.concatenate([curvature, at_zero], axis=2))
+            slopes, offsets = both[..., :-1], both[..., -1:]
         else:
-            factors = self.factor * self.identity
-        slopes, offsets = factors @ curvature, factors @ at_zero
+            slopes, offsets = self.factor * curvature, self.factor * at_zero
         return lambda clean, step: (offsets[step] - slopes[step] @ clean.T[:, :, None])[:, :, 0].T
 
 
@@ -335,8 +344,9 @@ class NumpyActing:
         self.rule = None if rule is None else _Rule(rule, policy.actor.schedule, policy.actor.action_dim)
         self._blas = ThreadpoolController().select(user_api="blas")
         self._modules = self._modules_of(policy)
-        self._tensors = [tensor for module in self._modules for tensor in (*module.parameters(), *module.buffers())]
-        self._addresses = [tensor.data_ptr() for tensor in self._tensors]
+        tensors = (tensor for module in self._modules for tensor in (*module.parameters(), *module.buffers()))
+        self._find_addresses = [tensor.data_ptr for tensor in tensors]
+        self._addresses = [find() for find in self._find_addresses]
 
     @staticmethod
     def _modules_of(policy: Policy) -> tuple[nn.Module, ...]:
@@ -352,7 +362,7 @@ class NumpyActing:
         :return: Whether the views are still those of its networks, which may have been moved or replaced
         """
         same = all(ours is theirs for ours, theirs in zip(self._modules, self._modules_of(policy), strict=True))
-        return same and [tensor.data_ptr() for tensor in self._tensors] == self._addresses
+        return same and [find() for find in self._find_addresses] == self._addresses
 
     @staticmethod
     def covers(policy: Policy) -> bool:
@@ -396,7 +406,8 @@ class NumpyActing:
         bound = self.denoiser.bind(features.T, time_part)
         noise = noise.transpose(0, 2, 1)
         repeated = bound if n_candidates == 1 else np.repeat(bound, n_candidates, axis=2)
-        candidates = self.denoiser.sample(repeated, noise)
+        first_prediction = self.denoiser.predict_noise(noise[0], repeated[-1])
+        candidates = self.denoiser.sample(repeated, noise, first_prediction)
         best = np.arange(0, noise.shape[2], n_candidates)
         if n_candidates > 1:
             values = self.critics.values(features.T, candidates, n_candidates)
@@ -406,7 +417,7 @@ class NumpyActing:
             return action
         assert self.rule is not None
         shift = self.rule.shift(action, *self._local_model(policy, features, action, time_part))
-        return np.ascontiguousarray(self.denoiser.sample(bound, noise[:, :, best], shift).T)
+        return np.ascontiguousarray(self.denoiser.sample(bound, noise[:, :, best], first_prediction[:, best], shift).T)
 
     def _local_model(
         self, policy: Policy, state: np.ndarray, action: np.ndarray, time_part: np.ndarray
