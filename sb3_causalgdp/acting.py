@@ -6,7 +6,8 @@ same numbers are computed on the same memory: the arrays are views of the networ
 gets out of date while they are trained. What is not covered is left to the plain path, see :meth:`NumpyActing.covers`.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import reduce
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -89,6 +90,36 @@ def _linear_layers(modules: Any, activation: type[nn.Module]) -> list[Layer] | N
     return layers
 
 
+class _LayerNorm:
+    """``nn.LayerNorm`` of columns."""
+
+    def __init__(self, module: nn.LayerNorm) -> None:
+        self.weight, self.bias = _view(module.weight)[:, None], _view(module.bias)[:, None]
+        self.epsilon = np.float32(module.eps)
+
+    def __call__(self, values: np.ndarray) -> np.ndarray:
+        standardised, _ = self._standardise(values)
+        return self.weight * standardised + self.bias
+
+    def backward(self, gradient: np.ndarray, values: np.ndarray) -> np.ndarray:
+        """From the gradient by what came out, the one by the values that went in."""
+        standardised, inverse_std = self._standardise(values)
+        gradient = self.weight * gradient
+        along = (gradient * standardised).mean(axis=0)
+        return inverse_std * (gradient - gradient.mean(axis=0) - along * standardised)
+
+    def _standardise(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        centred = values - values.mean(axis=0)
+        inverse_std = 1.0 / np.sqrt((centred * centred).mean(axis=0) + self.epsilon)
+        return centred * inverse_std, inverse_std
+
+
+def _without_norms(modules: Any) -> tuple[list[nn.Module], list[_LayerNorm]]:
+    """The other modules, and the normalisations: one behind each layer but the last, or none."""
+    norms = [_LayerNorm(module) for module in modules if isinstance(module, nn.LayerNorm)]
+    return [module for module in modules if not isinstance(module, nn.LayerNorm)], norms
+
+
 def _through(gradient: np.ndarray, jacobian: np.ndarray) -> np.ndarray:
     """Gradient by the next state, shape ``(batch, n)``, times its Jacobian, ``(n, batch, d)``: shape ``(batch, d)``."""
     return (gradient[:, None] @ jacobian.transpose(1, 0, 2))[:, 0]
@@ -165,62 +196,87 @@ class _Denoiser:
         return action
 
 
+class _Hidden(NamedTuple):
+    """A hidden layer of a critic: what the product gave, the same normalised if the critic is, and the activation of that."""
+
+    product: np.ndarray
+    normalised: np.ndarray
+    output: np.ndarray
+
+    def columns(self, chosen: np.ndarray) -> "_Hidden":
+        return _Hidden(*(part[:, chosen] for part in self))
+
+
+class _Critic:
+    """One target critic."""
+
+    def __init__(self, network: nn.Sequential, activation_fn: type[nn.Module]) -> None:
+        modules, norms = _without_norms(network)
+        layers = _linear_layers(modules, activation_fn)
+        assert layers is not None
+        self.layers = layers
+        self.norms: Sequence[_LayerNorm | None] = norms or [None] * (len(layers) - 1)
+        self.activation = ACTIVATIONS[activation_fn]
+
+    def values(self, features: np.ndarray, actions: np.ndarray, n_candidates: int) -> np.ndarray:
+        """Q of several actions for each features; the features' part of the first layer is computed once."""
+        (weight, bias), *layers = self.layers
+        hidden = np.repeat(weight[:, : len(features)] @ features + bias, n_candidates, axis=1)
+        hidden += weight[:, len(features) :] @ actions
+        for norm, (next_weight, next_bias) in zip(self.norms, layers, strict=True):
+            hidden = next_weight @ self._hidden(norm, hidden).output
+            hidden += next_bias
+        return hidden
+
+    def forward(self, inputs: np.ndarray) -> tuple[np.ndarray, list[_Hidden]]:
+        """The values, and the hidden layers."""
+        hidden = []
+        for norm, (weight, bias) in zip(self.norms, self.layers[:-1], strict=True):
+            product = weight @ inputs
+            product += bias
+            hidden.append(self._hidden(norm, product))
+            inputs = hidden[-1].output
+        weight, bias = self.layers[-1]
+        return weight @ inputs + bias, hidden
+
+    def _hidden(self, norm: _LayerNorm | None, product: np.ndarray) -> _Hidden:
+        normalised = product if norm is None else norm(product)
+        return _Hidden(product, normalised, self.activation.value(normalised))
+
+    def backward(self, hidden: list[_Hidden], n_states: int) -> np.ndarray:
+        """Gradient of the values by the states, the first of the inputs."""
+        weights = [weight for weight, _ in self.layers]
+        weights[0] = weights[0][:, :n_states]
+        gradient = weights[-1].T
+        for weight, layer, norm in zip(weights[-2::-1], reversed(hidden), reversed(self.norms), strict=True):
+            gradient = gradient * self.activation.derivative(layer.normalised, layer.output)
+            gradient = weight.T @ (gradient if norm is None else norm.backward(gradient, layer.product))
+        return gradient
+
+
 class _Critics:
     """The target critics: the smallest Q, and its gradient by the state."""
 
     def __init__(self, policy: Policy) -> None:
-        self.networks = []
-        for network in policy.critic_target.q_networks:
-            layers = _linear_layers(network, policy.activation_fn)
-            assert layers is not None
-            self.networks.append(layers)
-        self.activation = ACTIVATIONS[policy.activation_fn]
+        self.networks = [_Critic(network, policy.activation_fn) for network in policy.critic_target.q_networks]
 
     def values(self, features: np.ndarray, actions: np.ndarray, n_candidates: int) -> np.ndarray:
-        """Smallest Q of several actions for each features; the features' part of the first layer is computed once."""
-        smallest = None
-        for (weight, bias), *layers in self.networks:
-            hidden = np.repeat(weight[:, : len(features)] @ features + bias, n_candidates, axis=1)
-            hidden += weight[:, len(features) :] @ actions
-            for next_weight, next_bias in layers:
-                hidden = next_weight @ self.activation.value(hidden)
-                hidden += next_bias
-            smallest = hidden if smallest is None else np.minimum(smallest, hidden)
-        assert smallest is not None
-        return smallest[0]
+        """Smallest Q of several actions for each features."""
+        return reduce(np.minimum, (network.values(features, actions, n_candidates) for network in self.networks))[0]
 
     def gradient(self, state: np.ndarray, action: np.ndarray) -> np.ndarray:
         """Of the smallest Q, by the state, shape ``(n, batch)``."""
         inputs = np.concatenate([state, action])
-        passes = [self._forward(layers, inputs) for layers in self.networks]
+        passes = [network.forward(inputs) for network in self.networks]
         smallest = np.argmin(np.concatenate([values for values, _ in passes]), axis=0)
         if len(set(smallest.tolist())) == 1:
-            return self._backward(self.networks[smallest[0]], passes[smallest[0]][1], len(state))
+            return self.networks[smallest[0]].backward(passes[smallest[0]][1], len(state))
         gradient = np.empty_like(state)
-        for index, (layers, (_, hidden)) in enumerate(zip(self.networks, passes, strict=True)):
+        for index, (network, (_, hidden)) in enumerate(zip(self.networks, passes, strict=True)):
             columns = smallest == index
             if columns.any():
-                chosen = [(before[:, columns], after[:, columns]) for before, after in hidden]
-                gradient[:, columns] = self._backward(layers, chosen, len(state))
+                gradient[:, columns] = network.backward([layer.columns(columns) for layer in hidden], len(state))
         return gradient
-
-    def _forward(self, layers: list[Layer], inputs: np.ndarray) -> tuple[np.ndarray, list[tuple[np.ndarray, np.ndarray]]]:
-        """The values, and of each hidden layer what went into its activation and what came out."""
-        hidden = []
-        for weight, bias in layers[:-1]:
-            before = weight @ inputs
-            before += bias
-            inputs = self.activation.value(before)
-            hidden.append((before, inputs))
-        weight, bias = layers[-1]
-        return weight @ inputs + bias, hidden
-
-    def _backward(self, layers: list[Layer], hidden: list[tuple[np.ndarray, np.ndarray]], n_states: int) -> np.ndarray:
-        gradient = layers[-1][0].T
-        for (weight, _), (before, after) in zip(reversed(layers[1:-1]), reversed(hidden[1:]), strict=True):
-            gradient = weight.T @ (gradient * self.activation.derivative(before, after))
-        weight = layers[0][0][:, :n_states]
-        return weight.T @ (gradient * self.activation.derivative(*hidden[0])) if hidden else weight.T
 
 
 class _Blocks:
@@ -372,7 +428,8 @@ class NumpyActing:
             a guidance without the denoiser's Jacobian
         """
         rule, activation = policy.guidance_rule, policy.activation_fn
-        networks: list[Any] = [policy.actor.denoiser.network, *policy.critic_target.q_networks]
+        critics = (_without_norms(network)[0] for network in policy.critic_target.q_networks)
+        networks: list[Any] = [policy.actor.denoiser.network, *critics]
         return (
             policy.device.type == "cpu"
             and type(policy.observation_space) is spaces.Box

@@ -12,6 +12,7 @@ from stable_baselines3.common.torch_layers import (
     CombinedExtractor,
     FlattenExtractor,
     NatureCNN,
+    create_mlp,
     get_actor_critic_arch,
 )
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
@@ -65,6 +66,43 @@ def q_values(
     """
     inputs = th.cat([features, actions], dim=1)
     return [network(inputs) for network in critic.q_networks[networks]]
+
+
+class Critic(ContinuousCritic):
+    """
+    SB3's critics, with layer normalisation between each hidden layer and its activation if asked for.
+
+    :param observation_space: Observation space
+    :param action_space: Action space
+    :param net_arch: Hidden layers
+    :param features_extractor: Network that turns observations into features
+    :param features_dim: Number of features
+    :param activation_fn: Activation class
+    :param layer_norm: Whether to normalise the hidden layers
+    :param kwargs: Other keyword arguments of SB3's critic
+    """
+
+    def __init__(
+        self,
+        observation_space: spaces.Space,
+        action_space: spaces.Box,
+        net_arch: list[int],
+        features_extractor: BaseFeaturesExtractor,
+        features_dim: int,
+        activation_fn: type[nn.Module] = nn.ReLU,
+        layer_norm: bool = False,
+        **kwargs: Any,
+    ) -> None:
+        super().__init__(
+            observation_space, action_space, net_arch, features_extractor, features_dim, activation_fn=activation_fn, **kwargs
+        )
+        if not layer_norm:
+            return
+        sizes = (features_dim + get_action_dim(action_space), 1, net_arch)
+        for index in range(self.n_critics):
+            network = nn.Sequential(*create_mlp(*sizes, activation_fn, post_linear_modules=[nn.LayerNorm]))
+            self.q_networks[index] = network
+            setattr(self, f"qf{index}", network)
 
 
 class DiffusionActor(BasePolicy):
@@ -193,6 +231,8 @@ class CausalGDPPolicy(BasePolicy):
     :param optimizer_class: Optimizer of the actor, the critics and the world model
     :param optimizer_kwargs: Its keyword arguments, without the learning rate
     :param n_critics: Number of critics
+    :param critic_layer_norm: Whether the critics' hidden layers have layer normalisation, which bounds what they say of
+        actions that the data does not hold (RLPD, Ball et al., 2023, section 4.2): for offline data with ``learn()`` after it
     :param share_features_extractor: Whether actor and critics share one features extractor
     :param world_model_net_arch: Hidden layers of the world model, all of one size, ``[128, 128]`` by default
     :param diffusion_steps: Number of diffusion steps K
@@ -233,6 +273,7 @@ class CausalGDPPolicy(BasePolicy):
         optimizer_class: type[th.optim.Optimizer] = th.optim.Adam,
         optimizer_kwargs: dict[str, Any] | None = None,
         n_critics: int = 2,
+        critic_layer_norm: bool = False,
         share_features_extractor: bool = False,
         world_model_net_arch: list[int] | None = None,
         diffusion_steps: int = 5,
@@ -290,6 +331,7 @@ class CausalGDPPolicy(BasePolicy):
         self.net_arch = [256, 256] if net_arch is None else net_arch
         self.activation_fn = activation_class(activation_fn)
         self.n_critics = n_critics
+        self.critic_layer_norm = critic_layer_norm
         self.share_features_extractor = share_features_extractor
         self.world_model_net_arch = world_model_net_arch
         actor_arch, critic_arch = get_actor_critic_arch(self.net_arch)
@@ -311,6 +353,7 @@ class CausalGDPPolicy(BasePolicy):
             "activation_fn": fast(self.activation_fn),
             "net_arch": critic_arch,
             "n_critics": n_critics,
+            "layer_norm": critic_layer_norm,
             "share_features_extractor": share_features_extractor,
         }
         self._build(lr_schedule)
@@ -368,8 +411,8 @@ class CausalGDPPolicy(BasePolicy):
     def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> DiffusionActor:
         return DiffusionActor(**self._update_features_extractor(self.actor_kwargs, features_extractor)).to(self.device)
 
-    def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> ContinuousCritic:
-        return ContinuousCritic(**self._update_features_extractor(self.critic_kwargs, features_extractor)).to(self.device)
+    def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> Critic:
+        return Critic(**self._update_features_extractor(self.critic_kwargs, features_extractor)).to(self.device)
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         data = super()._get_constructor_parameters()
@@ -381,6 +424,7 @@ class CausalGDPPolicy(BasePolicy):
             optimizer_class=self.optimizer_class,
             optimizer_kwargs=self.optimizer_kwargs,
             n_critics=self.n_critics,
+            critic_layer_norm=self.critic_layer_norm,
             share_features_extractor=self.share_features_extractor,
             world_model_net_arch=self.world_model_net_arch,
             lr_schedule=self._dummy_schedule,  # not needed for loading the policy alone

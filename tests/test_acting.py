@@ -16,11 +16,16 @@ from sb3_causalgdp.offline.replay import SpacesEnv
 N_STATES, N_ACTIONS = 5, 3
 
 
-def make_policy(seed=0, observation_space=None, net_arch=(16, 16), activation_fn="relu", **kwargs):
+def make_policy(seed=0, observation_space=None, net_arch=(16, 16), activation_fn="relu", critic_layer_norm=False, **kwargs):
     """A policy whose weights, masks and statistics are all different from their start values, and whose guidance is on."""
     observation_space = observation_space or spaces.Box(-3.0, 3.0, (N_STATES,), np.float32)
     environment = SpacesEnv(observation_space, spaces.Box(-1.0, 1.0, (N_ACTIONS,), np.float32))
-    policy_kwargs = {"net_arch": list(net_arch), "world_model_net_arch": [16, 16], "activation_fn": activation_fn}
+    policy_kwargs = {
+        "net_arch": list(net_arch),
+        "world_model_net_arch": [16, 16],
+        "activation_fn": activation_fn,
+        "critic_layer_norm": critic_layer_norm,
+    }
     kind = "MultiInputPolicy" if isinstance(observation_space, spaces.Dict) else "MlpPolicy"
     model = CausalGDP(kind, environment, policy_kwargs=policy_kwargs, buffer_size=10, device="cpu", **kwargs)
     th.manual_seed(seed)
@@ -87,8 +92,9 @@ def test_every_guidance(guidance, guidance_target, state_guidance_scale):
 @pytest.mark.parametrize("activation_fn", ["relu", "tanh", "mish", "silu"])
 @pytest.mark.parametrize("net_arch", [(16,), (16, 16, 16)])
 @pytest.mark.parametrize("deterministic", [False, True])
-def test_every_activation_and_depth(activation_fn, net_arch, deterministic):
-    policy = make_policy(activation_fn=activation_fn, net_arch=net_arch)
+@pytest.mark.parametrize("critic_layer_norm", [False, True])
+def test_every_activation_and_depth(activation_fn, net_arch, deterministic, critic_layer_norm):
+    policy = make_policy(activation_fn=activation_fn, net_arch=net_arch, critic_layer_norm=critic_layer_norm)
     fast, plain = both_paths(policy, states(3), deterministic)
     assert policy._acting is not None
     th.testing.assert_close(fast, plain, rtol=1e-5, atol=1e-5)

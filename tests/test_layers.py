@@ -17,6 +17,7 @@ LAYERS = [
     {"policies"},
     {"acting"},
     {"causal", "offline", "diffusion"},
+    {"checks"},
 ]
 WITHOUT_SB3 = {"causal", "diffusion", "losses"}
 LEVELS = {part: level for level, parts in enumerate(LAYERS) for part in parts}

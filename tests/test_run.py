@@ -157,6 +157,21 @@ def test_number_of_critics(n_critics):
     assert len(model.critic.q_networks) == len(model.critic_target.q_networks) == n_critics
 
 
+def test_layer_norm_of_the_critics_bounds_their_values():
+    plain, normalised = (
+        learn(policy_kwargs={**SMALL["policy_kwargs"], "critic_layer_norm": layer_norm}) for layer_norm in (False, True)
+    )
+    n_layers = len(SMALL["policy_kwargs"]["net_arch"])
+    for critic in (normalised.critic, normalised.critic_target):
+        assert [sum(isinstance(one, th.nn.LayerNorm) for one in network) for network in critic.q_networks] == [n_layers] * 2
+        names = {name.split(".")[0] for name, _ in critic.named_parameters()}
+        assert names == {"qf0", "qf1"} and all(getattr(critic, f"qf{i}") is critic.q_networks[i] for i in (0, 1))
+    far = 1e6 * th.ones(1, 3), th.ones(1, 1)
+    with th.no_grad():
+        assert abs(float(plain.critic(*far)[0])) > 1e3
+        assert abs(float(normalised.critic(*far)[0])) < 1e3
+
+
 @pytest.mark.parametrize("n_parameters", [0, 1])
 def test_gradients_are_bounded(n_parameters, monkeypatch):
     model = learn(24, max_grad_norm=1e-3, policy_delay=1)

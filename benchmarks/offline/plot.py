@@ -25,6 +25,7 @@ LABELS = {
     "perturbed": "CausalGDP, perturbed graph",
     "open": "CausalGDP, all edges open",
     "no_guidance": "no guidance",
+    "layer_norm": "CausalGDP, critics with layer norm",
     "bc": "diffusion behaviour cloning",
     "td3_bc": "TD3+BC",
     "td3_bc_200": "TD3+BC, alpha 200",
