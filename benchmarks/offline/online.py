@@ -3,7 +3,7 @@ Offline to online: pretrain on a dataset, then go on in the environment; one cur
 
     export OMP_NUM_THREADS=1
     python -m sb3_causalgdp.datasets make hopper-medium-replay
-    python -m benchmarks.offline.online --tasks maze2d-umaze hopper-medium-replay --seeds 0 1 2 --workers 2
+    python -m benchmarks.offline.online --tasks maze2d-umaze hopper-medium-replay --methods causalgdp layer_norm --workers 2
     python -m benchmarks.offline.online --plot
 
 See docs/benchmarks_offline.md.
@@ -29,6 +29,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 import sb3_causalgdp.offline  # noqa: F401 (registers the environments)
 from benchmarks.offline.data import ensure_dataset, environment_id
 from benchmarks.offline.methods import CAUSALGDP_METHODS, study_arguments
+from benchmarks.offline.plot import LABELS
 from benchmarks.suite.jobs import grid
 from benchmarks.suite.run import add_run_options, run_from_options
 from sb3_causalgdp import CausalGDP
@@ -155,7 +156,8 @@ def draw(table: pd.DataFrame, path: Path) -> None:
         for colour, (method, runs) in zip(("C0", "C1", "C2"), rows.groupby("method"), strict=False):
             curves = runs.pivot(index="x", columns="seed", values="score")
             axes.plot(curves.index, curves, color=colour, alpha=0.35, linewidth=0.9)
-            axes.plot(curves.index, curves.mean(axis=1), color=colour, linewidth=2, marker="o", markersize=3, label=method)
+            style = {"linewidth": 2, "marker": "o", "markersize": 3, "label": LABELS[method]}
+            axes.plot(curves.index, curves.mean(axis=1), color=colour, **style)
         axes.axvline(length, color="black", linestyle="--", linewidth=1)
         axes.set(title=task, xlabel="gradient updates, then environment steps", ylabel="D4RL's normalised score")
         axes.set_ylim(bottom=min(0.0, axes.get_ylim()[0]))  # a tenth of a point is no fall
