@@ -72,37 +72,19 @@ class Critic(ContinuousCritic):
     """
     SB3's critics, with layer normalisation between each hidden layer and its activation if asked for.
 
-    :param observation_space: Observation space
-    :param action_space: Action space
-    :param net_arch: Hidden layers
-    :param features_extractor: Network that turns observations into features
-    :param features_dim: Number of features
-    :param activation_fn: Activation class
     :param layer_norm: Whether to normalise the hidden layers
-    :param kwargs: Other keyword arguments of SB3's critic
+    :param kwargs: Keyword arguments of SB3's critics
     """
 
-    def __init__(
-        self,
-        observation_space: spaces.Space,
-        action_space: spaces.Box,
-        net_arch: list[int],
-        features_extractor: BaseFeaturesExtractor,
-        features_dim: int,
-        activation_fn: type[nn.Module] = nn.ReLU,
-        layer_norm: bool = False,
-        **kwargs: Any,
-    ) -> None:
-        super().__init__(
-            observation_space, action_space, net_arch, features_extractor, features_dim, activation_fn=activation_fn, **kwargs
-        )
+    def __init__(self, layer_norm: bool = False, **kwargs: Any) -> None:
+        super().__init__(**kwargs)
         if not layer_norm:
             return
-        sizes = (features_dim + get_action_dim(action_space), 1, net_arch)
+        n_inputs = kwargs["features_dim"] + get_action_dim(kwargs["action_space"])
         for index in range(self.n_critics):
-            network = nn.Sequential(*create_mlp(*sizes, activation_fn, post_linear_modules=[nn.LayerNorm]))
-            self.q_networks[index] = network
-            setattr(self, f"qf{index}", network)
+            layers = create_mlp(n_inputs, 1, kwargs["net_arch"], kwargs["activation_fn"], post_linear_modules=[nn.LayerNorm])
+            self.q_networks[index] = nn.Sequential(*layers)
+            setattr(self, f"qf{index}", self.q_networks[index])
 
 
 class DiffusionActor(BasePolicy):
