@@ -8,6 +8,7 @@ gets out of date while they are trained. What is not covered is left to the plai
 
 from collections.abc import Callable, Sequence
 from functools import reduce
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -114,10 +115,19 @@ class _LayerNorm:
         return centred * inverse_std, inverse_std
 
 
-def _without_norms(modules: Any) -> tuple[list[nn.Module], list[_LayerNorm]]:
-    """The other modules, and the normalisations: one behind each layer but the last, or none."""
-    norms = [_LayerNorm(module) for module in modules if isinstance(module, nn.LayerNorm)]
-    return [module for module in modules if not isinstance(module, nn.LayerNorm)], norms
+def _without_norms(network: nn.Sequential) -> tuple[list[nn.Module], list[nn.LayerNorm]]:
+    """The normalisations where each layer but the last has one right behind it, else none; and all other modules."""
+    modules = list(network)
+    norms = [after for layer, after in pairwise(modules[:-1]) if isinstance(layer, nn.Linear) and _normalises(after, layer)]
+    if len(norms) != sum(isinstance(module, nn.Linear) for module in modules) - 1:
+        return modules, []
+    return [module for module in modules if not any(module is norm for norm in norms)], norms  # type: ignore[return-value]
+
+
+def _normalises(module: nn.Module, layer: nn.Linear) -> bool:
+    if type(module) is not nn.LayerNorm or module.normalized_shape != (layer.out_features,):
+        return False
+    return module.weight is not None and module.bias is not None
 
 
 def _through(gradient: np.ndarray, jacobian: np.ndarray) -> np.ndarray:
@@ -215,7 +225,7 @@ class _Critic:
         layers = _linear_layers(modules, activation_fn)
         assert layers is not None
         self.layers = layers
-        self.norms: Sequence[_LayerNorm | None] = norms or [None] * (len(layers) - 1)
+        self.norms: Sequence[_LayerNorm | None] = [_LayerNorm(norm) for norm in norms] or [None] * (len(layers) - 1)
         self.activation = ACTIVATIONS[activation_fn]
 
     def values(self, features: np.ndarray, actions: np.ndarray, n_candidates: int) -> np.ndarray:

@@ -159,6 +159,23 @@ def test_what_is_not_covered_takes_the_plain_path(kwargs):
     assert policy._acting is None
 
 
+@pytest.mark.parametrize("norm", ["before the layer", "behind the activation", "without weights", "behind one layer of two"])
+def test_own_critics_with_other_normalisations_take_the_plain_path(norm):
+    policy = make_policy()
+    for network in policy.critic_target.q_networks:
+        if norm == "before the layer":
+            network.insert(0, th.nn.LayerNorm(N_STATES + N_ACTIONS))
+        elif norm == "behind the activation":
+            network.insert(4, th.nn.LayerNorm(16)).insert(2, th.nn.LayerNorm(16))
+        elif norm == "without weights":
+            network.insert(3, th.nn.LayerNorm(16, elementwise_affine=False)).insert(
+                1, th.nn.LayerNorm(16, elementwise_affine=False)
+            )
+        else:
+            network.insert(1, th.nn.LayerNorm(16))
+    assert not NumpyActing.covers(policy)
+
+
 def test_many_rows_take_the_plain_path(monkeypatch):
     policy = make_policy()
     monkeypatch.setattr(NumpyActing, "__call__", lambda *args: pytest.fail("numpy"))

@@ -7,6 +7,7 @@ from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 
 from sb3_causalgdp import CausalGDP
+from sb3_causalgdp.losses import denoising_loss
 from sb3_causalgdp.offline.replay import split_sample
 from sb3_causalgdp.policies import q_values
 
@@ -87,6 +88,28 @@ def q_term_and_its_noise(model, data):
     predicted = actor.denoiser(noisy, step, actor.features(data.observations))
     clean = (noisy - (1.0 - alpha_bar).sqrt() * predicted) / alpha_bar.sqrt()
     return q_term, clean.clamp(-1.0, 1.0)
+
+
+@pytest.mark.parametrize("n_critics, climbed, scale", [(1, 0, 0), (3, 0, 1), (3, 1, 2), (3, 2, 0)])
+def test_the_next_critic_sets_the_scale_and_a_single_one_its_own(n_critics, climbed, scale):
+    policy_kwargs = {"net_arch": [8], "n_critics": n_critics}
+    model = CausalGDP("MlpPolicy", "Pendulum-v1", policy_kwargs=policy_kwargs, learning_starts=64, seed=0, device="cpu")
+    model.learn(64)
+    data = model.replay_buffer.sample(64)
+    losses = []
+    for plain in (False, True):
+        th.manual_seed(5)
+        if plain:
+            _, actions = denoising_loss(
+                model.actor.denoiser, model.actor.schedule, model.actor.features(data.observations), data.actions
+            )
+            values = q_values(model.critic, data.observations.float(), actions)
+            losses.append(-values[climbed].mean() / values[scale].detach().abs().mean())
+        else:
+            losses.append(model._actor_losses(data, data.actions, climbed, False)[1])
+    th.testing.assert_close(*losses)
+    ours, theirs = (th.autograd.grad(loss, list(model.actor.parameters())) for loss in losses)
+    th.testing.assert_close(ours, theirs, rtol=1e-4, atol=1e-6)
 
 
 def test_one_step_judges_the_clean_estimate_of_the_denoising_term():

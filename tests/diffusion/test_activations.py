@@ -22,10 +22,12 @@ def test_mish_and_its_gradient_are_those_of_pytorch(dtype, tolerance, is_compili
 
 
 def test_mish_without_gradients_leaves_its_input_alone():
-    x = th.linspace(-90.0, 90.0, 2_001)
+    x = th.randn(50)
     before = x.clone()
     with th.no_grad():
-        th.testing.assert_close(FastMish()(x), F.mish(before), rtol=1e-6, atol=90 * 1e-7)
+        th.testing.assert_close(FastMish()(x), F.mish(before), rtol=1e-6, atol=1e-6)
+        large = th.linspace(-90.0, 90.0, 2_001)
+        th.testing.assert_close(FastMish()(large), F.mish(large), rtol=1e-6, atol=90 * 1e-7)
     th.testing.assert_close(x, before, rtol=0, atol=0)
 
 
