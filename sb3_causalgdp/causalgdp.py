@@ -33,6 +33,7 @@ from sb3_causalgdp.causal.graph import replaced_when_done
 from sb3_causalgdp.causal.interventions import ActionRule
 from sb3_causalgdp.causal.world_model import MaskedWorldModel
 from sb3_causalgdp.checks import check_at_least_zero, is_count
+from sb3_causalgdp.gradients import Gradients, check_compile, compiled, gradients_of
 from sb3_causalgdp.losses import critic_loss, denoising_loss, q_loss, td_target, world_model_loss
 from sb3_causalgdp.offline.algorithm import OfflineToOnlineAlgorithm, callback_list
 from sb3_causalgdp.offline.replay import concatenate_samples, split_sample
@@ -40,7 +41,7 @@ from sb3_causalgdp.policies import CausalGDPPolicy, CnnPolicy, DiffusionActor, M
 from sb3_causalgdp.structural import StatePolicy, actions_of, make_structural_model, states_of
 
 ACTOR_UPDATES = ("one_step", "chain")
-COMPILED_LOSSES = ("_td_target", "_critic_loss", "_world_model_losses", "_actor_losses")
+COMPILED = ("_critic_gradients", "_world_model_gradients", "_actor_gradients")
 
 SelfCausalGDP = TypeVar("SelfCausalGDP", bound="CausalGDP")
 
@@ -304,11 +305,9 @@ class CausalGDP(OfflineToOnlineAlgorithm):
         self.critic_batch_norm_stats_target = get_parameters_by_name(self.critic_target, ["running_"])
 
     def _setup_compile(self) -> None:
-        for name in COMPILED_LOSSES:
-            loss = getattr(type(self), name).__get__(self)
-            if self.compile:
-                loss = th.compile(loss, mode=None if self.compile is True else self.compile)
-            setattr(self, name, loss)
+        for name in COMPILED:
+            function = getattr(type(self), name).__get__(self)
+            setattr(self, name, compiled(function, self.compile) if self.compile else function)
 
     def _setup_discovery(self) -> None:
         self.discovery = make_discovery(self.causal_discovery, **self.causal_discovery_kwargs)
@@ -328,6 +327,7 @@ class CausalGDP(OfflineToOnlineAlgorithm):
 
     def _check_arguments(self) -> None:
         check_at_least_zero(eta=self.eta, denoising_weight=self.denoising_weight)
+        check_compile(self.compile)
         if self.causal_refresh_freq < 1:
             raise ValueError(f"causal_refresh_freq must be at least 1 environment step, got {self.causal_refresh_freq!r}")
         for name in ("policy_delay", "world_model_delay"):
@@ -556,13 +556,18 @@ class CausalGDP(OfflineToOnlineAlgorithm):
         return ReplayBuffer._get_samples(replay_buffer, indices, env=self._vec_normalize_env)
 
     def _update_critics(self, replay_data) -> tuple[th.Tensor, dict[str, th.Tensor]]:
+        next_actions, target_std, loss, gradients = self._critic_gradients(replay_data)
+        self._step(self.critic, gradients)
+        with th.no_grad():
+            self.policy.return_std.lerp_(target_std, self._running_weight())
+        return next_actions, {"critic_loss": loss}
+
+    def _critic_gradients(self, replay_data) -> tuple[th.Tensor, th.Tensor, th.Tensor, Gradients]:
         with th.no_grad():
             next_actions, target = self._td_target(replay_data)
-        loss = self._critic_loss(replay_data, target)
-        self._optimize(self.critic, loss)
-        with th.no_grad():
-            self.policy.return_std.lerp_(target.std(correction=0).clamp(min=1e-3), self._running_weight())
-        return next_actions, {"critic_loss": loss}
+            target_std = target.std(correction=0).clamp(min=1e-3)
+        loss = critic_loss(self.critic(replay_data.observations, replay_data.actions), target)
+        return next_actions, target_std, loss.detach(), gradients_of(self.critic, loss)
 
     def _td_target(self, replay_data) -> tuple[th.Tensor, th.Tensor]:
         # For n-step replay, discount factor is gamma**n_steps (when no early termination)
@@ -575,9 +580,6 @@ class CausalGDP(OfflineToOnlineAlgorithm):
         next_q_values = q_values(self.critic_target, critic_features.repeat_interleave(n_actions, dim=0), next_actions)
         target = td_target(next_q_values, replay_data.rewards, replay_data.dones, discounts, n_actions)
         return next_actions[::n_actions], target
-
-    def _critic_loss(self, replay_data, target: th.Tensor) -> th.Tensor:
-        return critic_loss(self.critic(replay_data.observations, replay_data.actions), target)
 
     def _running_weight(self) -> float:
         # The first batches are averaged, so that the start value is forgotten at once
@@ -594,20 +596,27 @@ class CausalGDP(OfflineToOnlineAlgorithm):
         weight = 1.0 - transitions.dones.flatten() if self.optimize_memory_usage else None
         known = slice(None) if weight is None else weight > 0.0
         self.world_model.update_statistics(state[known], next_state[known], rewards[known])
-        transition, reward = self._world_model_losses(state, transitions.actions, next_state, rewards, weight)
-        self._optimize(self.world_model, transition + reward)
+        transition, reward, gradients = self._world_model_gradients(state, transitions.actions, next_state, rewards, weight)
+        self._step(self.world_model, gradients)
         return {"world_model_transition_loss": transition, "world_model_reward_loss": reward}
 
-    def _world_model_losses(self, *transitions: th.Tensor | None) -> tuple[th.Tensor, th.Tensor]:
-        return world_model_loss(self.world_model, *transitions)  # type: ignore[arg-type]
+    def _world_model_gradients(self, *transitions: th.Tensor | None) -> tuple[th.Tensor, th.Tensor, Gradients]:
+        transition, reward = world_model_loss(self.world_model, *transitions)  # type: ignore[arg-type]
+        return transition.detach(), reward.detach(), gradients_of(self.world_model, transition + reward)
 
     def _update_actor(self, transitions, next_actions: th.Tensor) -> dict[str, th.Tensor]:
         climbed = int(np.random.randint(len(self.critic.q_networks)))
-        with _frozen(self.critic.q_networks):
-            denoising, q_term = self._actor_losses(transitions, next_actions, climbed, self.policy.is_guided)
-            loss = self.denoising_weight * denoising + self.eta * q_term
-            self._optimize(self.actor, loss)
+        guided = self.policy.is_guided
+        denoising, q_term, loss, gradients = self._actor_gradients(transitions, next_actions, climbed, guided)
+        self._step(self.actor, gradients)
         return {"actor_loss": loss, "denoising_loss": denoising, "q_loss": q_term}
+
+    def _actor_gradients(
+        self, transitions, next_actions: th.Tensor, climbed: int, guided: bool
+    ) -> tuple[th.Tensor, th.Tensor, th.Tensor, Gradients]:
+        denoising, q_term = self._actor_losses(transitions, next_actions, climbed, guided)
+        loss = self.denoising_weight * denoising + self.eta * q_term
+        return denoising.detach(), q_term.detach(), loss.detach(), gradients_of(self.actor, loss)
 
     def _actor_losses(self, transitions, next_actions: th.Tensor, climbed: int, guided: bool) -> tuple[th.Tensor, th.Tensor]:
         observations = transitions.observations
@@ -633,13 +642,15 @@ class CausalGDP(OfflineToOnlineAlgorithm):
         (values,) = q_values(self.critic, critic_features, actions, slice(climbed, climbed + 1))
         return denoising, q_loss(values, scale)
 
-    def _optimize(self, module: th.nn.Module, loss: th.Tensor) -> None:
-        optimizer = _optimizer_of(module)
-        optimizer.zero_grad()
-        loss.backward()
+    def _step(self, module: th.nn.Module, gradients: Gradients) -> None:
+        for parameter, gradient in zip(module.parameters(), gradients, strict=True):
+            parameter.grad = gradient
         if self.max_grad_norm is not None and module is not self.world_model:
             th.nn.utils.clip_grad_norm_(module.parameters(), self.max_grad_norm)
-        optimizer.step()
+        _optimizer_of(module).step()
+        for parameter in module.parameters():
+            # A CUDA graph may write over what it returned
+            parameter.grad = None
 
     @th.no_grad()
     def _update_targets(self) -> None:
@@ -740,7 +751,7 @@ class CausalGDP(OfflineToOnlineAlgorithm):
             "critic",
             "critic_target",
             "world_model",
-            *COMPILED_LOSSES,
+            *COMPILED,
             "discovery",
             "_fed_offline_position",
             "causal_graph_history",
@@ -773,18 +784,6 @@ def _threads(n_threads: int | None) -> Iterator[None]:
         yield
     finally:
         th.set_num_threads(before)
-
-
-@contextmanager
-def _frozen(modules: Iterable[th.nn.Module]) -> Iterator[None]:
-    """No gradients for these parameters: the actor's loss flows through the critics, but does not train them."""
-    for module in modules:
-        module.requires_grad_(False)
-    try:
-        yield
-    finally:
-        for module in modules:
-            module.requires_grad_(True)
 
 
 def _flatten(callback: BaseCallback) -> list[BaseCallback]:

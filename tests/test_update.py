@@ -1,5 +1,7 @@
 """The fast parts of an update do what the plain ones do."""
 
+from functools import wraps
+
 import numpy as np
 import pytest
 import torch as th
@@ -24,7 +26,7 @@ def trained_model(**kwargs):
     """A model whose guidance is on, just before its next gradient step."""
     model = CausalGDP("MlpPolicy", "Pendulum-v1", **{**KWARGS, **kwargs})
     model.learn(215)
-    assert model.policy.is_guided
+    assert model.policy.is_guided is (kwargs.get("guidance", "posterior") is not None)
     model.policy.set_training_mode(True)
     return model
 
@@ -197,21 +199,62 @@ def weights_after(model, seed=3):
     return model.policy.state_dict()
 
 
-def test_compiled_losses_train_as_the_plain_ones_do(tmp_path, monkeypatch):
-    model = trained_model()
-    model.save(tmp_path / "model")
-    model.save_replay_buffer(tmp_path / "buffer")
+def compile_for_tests(monkeypatch, **options):
+    """Another backend than inductor's C++, whose compilation takes a minute; a graph that breaks is an error."""
     compile_ = th.compile
-    # The captured graphs and their derivatives, without a minute of C++
-    monkeypatch.setattr(th, "compile", lambda function, mode: compile_(function, backend="aot_eager"))
+
+    @wraps(compile_)
+    def compile_whole(function, **kwargs):
+        return compile_(function, **{**kwargs, "options": None, "fullgraph": True, **options})
+
+    monkeypatch.setattr(th, "compile", compile_whole)
+
+
+def assert_trains_alike(model, path, compile_=True):
+    model.save(path / "model")
+    model.save_replay_buffer(path / "buffer")
     states = []
-    for compiled in (False, True):
-        loaded = CausalGDP.load(tmp_path / "model", custom_objects={"compile": compiled})
-        loaded.load_replay_buffer(tmp_path / "buffer")
+    for mode in (False, compile_):
+        loaded = CausalGDP.load(path / "model", env=model.get_env(), custom_objects={"compile": mode})
+        loaded.load_replay_buffer(path / "buffer")
         loaded.set_logger(Logger(None, []))
+        assert loaded.policy.is_guided == model.policy.is_guided
         states.append(weights_after(loaded))
     for name, value in states[0].items():
         th.testing.assert_close(states[1][name], value, rtol=1e-5, atol=1e-6, msg=name)
+    return loaded
+
+
+COMPILABLE = {
+    "defaults": {},
+    "chain": {"actor_update": "chain"},
+    "mish": {"policy_kwargs": {"net_arch": [8], "activation_fn": "mish"}},
+    "no guidance": {"guidance": None},
+    "score": {"guidance": "score"},
+    "normalized, reward": {"guidance": "normalized", "guidance_target": "reward"},
+    "tweedie": {"guidance_covariance": "tweedie"},
+    "isotropic": {"guidance_covariance": "isotropic"},
+    "ddim": {"sampler": "ddim"},
+    "one critic": {"policy_kwargs": {"net_arch": [8], "n_critics": 1}},
+    "layer norm": {"policy_kwargs": {"net_arch": [8], "critic_layer_norm": True}},
+    "clipped": {"max_grad_norm": 0.1},
+    "max_q_backup": {"max_q_backup": True},
+    "memory": {"optimize_memory_usage": True, "replay_buffer_kwargs": {"handle_timeout_termination": False}},
+    "n steps": {"n_steps": 3},
+}
+
+
+@pytest.mark.parametrize("name", COMPILABLE)
+def test_an_update_is_one_graph_for_each_network_and_trains_as_without(tmp_path, monkeypatch, name):
+    compile_for_tests(monkeypatch, backend="aot_eager" if name == "defaults" else "eager")
+    model = trained_model(**COMPILABLE[name])
+    assert_trains_alike(model, tmp_path)
+
+
+def test_what_a_compiler_made_trains_as_the_plain_code_and_is_saved_as_a_wish(tmp_path):
+    policy_kwargs = {"net_arch": [8], "n_critics": 1, "world_model_net_arch": [8]}
+    model = trained_model(policy_delay=1, policy_kwargs=policy_kwargs)
+    loaded = assert_trains_alike(model, tmp_path)
     loaded.save(tmp_path / "again")
     assert CausalGDP.load(tmp_path / "again").compile is True
 

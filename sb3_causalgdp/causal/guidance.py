@@ -98,15 +98,15 @@ class CausalGuidance:
         self.state_scale = state_scale
         self.outcome_scale = outcome_scale
 
-    @th.no_grad()
     def __call__(self, action: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """
         :param action: Clean actions, shape ``(batch, d)``
         :return: Gradient, shape ``(batch, d)``, and curvature, shape ``(batch, d, d)``
         """
-        return self.at(self.world_model.action_response(self.state, action))
+        # A no_grad() as a decorator of a method cannot be compiled
+        with th.no_grad():
+            return self.at(self.world_model.action_response(self.state, action))
 
-    @th.no_grad()
     def at(self, response: ActionResponse) -> tuple[th.Tensor, th.Tensor]:
         """
         :param response: What the world model predicts at the actions

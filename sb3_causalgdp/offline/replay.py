@@ -44,17 +44,19 @@ def split_sample(sample: Any, n_parts: int) -> list[Any]:
 
     :param sample: Sample of a replay buffer
     :param n_parts: Number of batches
-    :return: The batches; views, no copies
+    :return: The batches, each in one piece of memory
     """
     if n_parts == 1:
         return [sample]
-    return [type(sample)(*(_every(part, first, n_parts) for part in sample)) for first in range(n_parts)]
+    fields = [_split(part, n_parts) for part in sample]
+    return [type(sample)(*(field[index] for field in fields)) for index in range(n_parts)]
 
 
-def _every(part: Any, first: int, step: int) -> Any:
+def _split(part: Any, n_parts: int) -> Sequence[Any]:
     if isinstance(part, dict):
-        return {key: values[first::step] for key, values in part.items()}
-    return None if part is None else part[first::step]
+        split = {key: _split(values, n_parts) for key, values in part.items()}
+        return [{key: values[index] for key, values in split.items()} for index in range(n_parts)]
+    return [None] * n_parts if part is None else part.unflatten(0, (-1, n_parts)).transpose(0, 1).contiguous().unbind()
 
 
 class SpacesEnv(VecEnv):

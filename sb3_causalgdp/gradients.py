@@ -1,0 +1,59 @@
+"""Losses together with their gradients, so that one compiled graph can hold the forward and the backward pass."""
+
+import inspect
+from collections.abc import Callable
+from functools import wraps
+from typing import Any
+
+import torch as th
+
+Gradients = tuple[th.Tensor | None, ...]
+"""One gradient for each parameter of a module, None where a parameter has no part in the loss or is not trained."""
+
+# One for each critic that is climbed, guided or not, for every batch size
+_MOST_GRAPHS = 64
+
+
+def gradients_of(module: th.nn.Module, loss: th.Tensor) -> Gradients:
+    """
+    :param module: The module that is trained
+    :param loss: Scalar
+    :return: The loss's gradient by each of the module's parameters, in their order; no other parameter's is computed
+    """
+    trained = [parameter for parameter in module.parameters() if parameter.requires_grad]
+    gradients = iter(th.autograd.grad(loss, trained, allow_unused=True))
+    return tuple(next(gradients) if parameter.requires_grad else None for parameter in module.parameters())
+
+
+def compiled(function: Callable[..., Any], mode: bool | str) -> Callable[..., Any]:
+    """
+    :param function: What to compile; it may take gradients, which become part of the graph
+    :param mode: True, or a mode of ``torch.compile``
+    :return: The function, compiled at its first call; it draws the same random numbers as the plain one
+    """
+    options = {} if mode is True else th._inductor.list_mode_options(mode)  # type: ignore[arg-type]
+    graph = th.compile(
+        function, options={**options, "fallback_random": True}, isolate_recompiles=True, recompile_limit=_MOST_GRAPHS
+    )
+
+    @wraps(function)
+    def call(*args: Any) -> Any:
+        with th._dynamo.config.patch(trace_autograd_ops=True):
+            return graph(*args)
+
+    return call
+
+
+def check_compile(mode: bool | str) -> None:
+    """
+    :param mode: False, True, or a mode of ``torch.compile``
+    :raises ValueError: If the mode is unknown, or this PyTorch cannot have a backward pass in a compiled graph
+    """
+    if mode is False:
+        return
+    modes = list(th._inductor.list_mode_options())
+    if mode is not True and mode not in modes:
+        raise ValueError(f"compile must be True, False or one of {modes}, got {mode!r}")
+    has_arguments = "isolate_recompiles" in inspect.signature(th.compile).parameters
+    if not (has_arguments and hasattr(th._dynamo.config, "trace_autograd_ops")):
+        raise ValueError(f"compile={mode!r} needs PyTorch 2.13 or newer, this is {th.__version__}; compile=False works with it")
