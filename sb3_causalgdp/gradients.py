@@ -56,4 +56,6 @@ def check_compile(mode: bool | str) -> None:
         raise ValueError(f"compile must be True, False or one of {modes}, got {mode!r}")
     has_arguments = "isolate_recompiles" in inspect.signature(th.compile).parameters
     if not (has_arguments and hasattr(th._dynamo.config, "trace_autograd_ops")):
-        raise ValueError(f"compile={mode!r} needs PyTorch 2.13 or newer, this is {th.__version__}; compile=False works with it")
+        raise ValueError(
+            f"compile={mode!r} needs PyTorch 2.13 or newer, this is {th.__version__}; compile=False works with it"
+        )

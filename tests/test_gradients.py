@@ -60,5 +60,5 @@ def test_unknown_compile_modes_are_named(mode):
 def test_compile_says_which_pytorch_it_needs(monkeypatch):
     monkeypatch.delattr(th._dynamo.config, "trace_autograd_ops", raising=False)
     monkeypatch.setattr(th, "compile", lambda model, mode=None: model)
-    with pytest.raises(ValueError, match="needs PyTorch 2.13 or newer"):
+    with pytest.raises(ValueError, match=r"needs PyTorch 2\.13 or newer"):
         CausalGDP("MlpPolicy", "Pendulum-v1", compile=True)

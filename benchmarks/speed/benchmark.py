@@ -59,6 +59,13 @@ class Benchmark:
         """
         return Results(self.args.folder, section)
 
+    def ours(self, settings: list[Contestant]) -> list[Contestant]:
+        """
+        :param settings: CausalGDP's
+        :return: The same, with their compiled twins unless these are not wanted
+        """
+        return settings if self.args.no_compile else contestants.with_compiled(settings)
+
     def diffusion_ql(self, diffusion_steps: int = 5) -> list[Contestant]:
         """
         :param diffusion_steps: K

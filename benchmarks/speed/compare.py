@@ -38,7 +38,7 @@ def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--steps", type=int, default=250, help="env_steps, refresh: environment steps of one turn")
     parser.add_argument("--learn-rounds", type=int, default=5, help="env_steps, refresh: turns of each contestant")
     parser.add_argument("--scaling-rounds", type=int, default=3, help="scaling: turns of each contestant at each point")
-    parser.add_argument("--no-compile", action="store_true", help="update: without compile=True, which takes minutes to start")
+    parser.add_argument("--no-compile", action="store_true", help="without compile=True, which takes a minute to start")
     return parser.parse_args(arguments)
 
 

@@ -5,7 +5,7 @@ from typing import Any
 from benchmarks.speed import contestants, learning
 from benchmarks.speed.benchmark import HALF_CHEETAH, Benchmark
 from benchmarks.speed.client import Contestant, median_ratio
-from benchmarks.speed.contestants import AUTHORS, DEFAULT, DIFFUSION_QL, MISH_NETS, SAC, SAME_NETS
+from benchmarks.speed.contestants import AUTHORS, DEFAULT, DIFFUSION_QL, MISH_NETS, SAC, SAME_NETS, compiled
 from benchmarks.speed.results import Results, Verdict
 
 COLUMNS = ("group", "contestant", "steps per CPU second", "ms per step", "ms per refresh", "share of refreshes", "status")
@@ -24,39 +24,32 @@ def run(benchmark: Benchmark) -> None:
     starts: dict[str, Any] = {"learning_starts": STARTS}
     ours = {**starts, "causal_refresh_freq": learning.REFRESH_PERIOD}
     every_step = {"gradient_steps": -1, **ours}
+    beside_sac = [contestants.causalgdp(DEFAULT, **ours), contestants.causalgdp(SAME, policy_kwargs=SAME_NETS, **ours)]
+    two_layers = {**MISH_NETS, "net_arch": [256, 256]}
+    ten_steps = [
+        contestants.causalgdp(TEN_STEPS, diffusion_steps=10, policy_kwargs=MISH_NETS, **ours),
+        contestants.causalgdp(TEN_STEPS_AS_AUTHORS, diffusion_steps=10, policy_kwargs=two_layers, **ours),
+    ]
+    n_envs = [contestants.causalgdp(ONE_ENV, **every_step), contestants.causalgdp(MANY_ENVS, n_envs=16, **every_step)]
     groups = {
-        "beside SAC": [
-            contestants.causalgdp(DEFAULT, **ours),
-            contestants.causalgdp(SAME, policy_kwargs=SAME_NETS, **ours),
-            contestants.sb3("SAC", **starts),
-        ],
-        "K=10": [
-            contestants.causalgdp(TEN_STEPS, diffusion_steps=10, policy_kwargs=MISH_NETS, **ours),
-            contestants.causalgdp(
-                TEN_STEPS_AS_AUTHORS,
-                diffusion_steps=10,
-                policy_kwargs={**MISH_NETS, "net_arch": [256, 256]},
-                **ours,
-            ),
-            *benchmark.diffusion_ql(10),
-            *benchmark.authors(),
-        ],
-        "one update for each step": [
-            contestants.causalgdp(ONE_ENV, **every_step),
-            contestants.causalgdp(MANY_ENVS, n_envs=16, **every_step),
-        ],
+        "beside SAC": [*benchmark.ours(beside_sac), contestants.sb3("SAC", **starts)],
+        "K=10": [*benchmark.ours(ten_steps), *benchmark.diffusion_ql(10), *benchmark.authors()],
+        "one update for each step": benchmark.ours(n_envs),
     }
     for group, who in groups.items():
         _measure(benchmark, results, group, who)
-    results.verdicts = [
-        _verdict(results, "env steps: CausalGDP default, guided, vs SB3 SAC 3x256", DEFAULT, SAC, 1.0, 1.4),
-        _verdict(results, "env steps: CausalGDP default with 3x256, guided, vs SB3 SAC 3x256", SAME, SAC, 1.0, 1.4),
-        _verdict(results, "env steps, K=10: CausalGDP Mish 3x256 vs Diffusion-QL in a plain loop", TEN_STEPS, DIFFUSION_QL),
-        _verdict(
-            results, "env steps, K=10: CausalGDP Mish 2x256 vs its authors' loop", TEN_STEPS_AS_AUTHORS, AUTHORS, 2.2, 3.0
-        ),
-        _verdict(results, "env steps: 16 environments vs 1, equal updates per step", MANY_ENVS, ONE_ENV, 1.3, 2.0),
-    ]
+    wanted: tuple[tuple[str, str, str, float | None, float | None], ...] = (
+        ("env steps: CausalGDP default, guided, vs SB3 SAC 3x256", DEFAULT, SAC, 1.0, 1.4),
+        ("env steps: CausalGDP default with 3x256, guided, vs SB3 SAC 3x256", SAME, SAC, 1.0, 1.4),
+        ("env steps, K=10: CausalGDP Mish 3x256 vs Diffusion-QL in a plain loop", TEN_STEPS, DIFFUSION_QL, None, None),
+        ("env steps, K=10: CausalGDP Mish 2x256 vs its authors' loop", TEN_STEPS_AS_AUTHORS, AUTHORS, 2.2, 3.0),
+        ("env steps: 16 environments vs 1, equal updates per step", MANY_ENVS, ONE_ENV, 1.3, 2.0),
+    )
+    for what, name, reference, must, goal in wanted:
+        results.verdicts.append(_verdict(results, what, name, reference, must, goal))
+        if not benchmark.args.no_compile:
+            twin = compiled(reference) if reference == ONE_ENV else reference
+            results.verdicts.append(_verdict(results, f"{what}, compiled", compiled(name), twin, must, goal))
     results.write(COLUMNS)
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from benchmarks.speed import contestants
 from benchmarks.speed.benchmark import HALF_CHEETAH, Benchmark
 from benchmarks.speed.client import Worker, median_ratio
-from benchmarks.speed.contestants import CHAIN, DEFAULT, ONE_STEP
+from benchmarks.speed.contestants import CHAIN, DEFAULT, ONE_STEP, compiled
 from benchmarks.speed.results import Row, Verdict, markdown
 
 COLUMNS = (
@@ -32,11 +32,14 @@ def run(benchmark: Benchmark) -> None:
     :param benchmark: What is shared
     """
     results = benchmark.results("floor")
-    ours = [one for one in contestants.our_settings() if one.name in (DEFAULT, ONE_STEP, CHAIN)]
-    who = [*ours, contestants.sb3("SAC"), *benchmark.diffusion_ql()]
+    ours = contestants.main_settings()
+    who = [*benchmark.ours(ours), contestants.sb3("SAC"), *benchmark.diffusion_ql()]
+    plain_of = {compiled(one.name): one.name for one in ours}
 
     def turn(worker: Worker) -> dict[str, float]:
         update = worker.ask("update", n=benchmark.updates)["cpu"] / benchmark.updates
+        if worker.contestant.name in plain_of:
+            return {"update": update}
         products = worker.ask("products")["value"]
         return {"update": update, "alone": products["seconds"], "products": products["n_products"], "rate": _rate(worker)}
 
@@ -44,8 +47,11 @@ def run(benchmark: Benchmark) -> None:
         turns = field.interleaved(benchmark.rounds, turn)
         for one in who:
             row: Row = {"contestant": one.name}
-            if one.name in turns:
-                row |= {"status": "ok", **_row(field.workers[one.name].ask("flops")["value"], turns[one.name])}
+            # What is compiled has the products of the plain code, which alone can be counted
+            counted = plain_of.get(one.name, one.name)
+            if one.name in turns and counted in turns:
+                both = [{**plain, **own} for plain, own in zip(turns[counted], turns[one.name], strict=True)]
+                row |= {"status": "ok", **_row(field.workers[counted].ask("flops")["value"], both)}
             results.rows.append(row | field.absent.get(one.name, {}))
         by_layer = next(iter(field.workers.values())).ask("layer_rates", shapes=LAYERS)["value"]
     rates: list[Row] = [{**one, "layer": name, "all three": one["layer"]} for name, one in by_layer.items()]
@@ -53,7 +59,9 @@ def run(benchmark: Benchmark) -> None:
     shares = {row["contestant"]: row.get("share of the floor") for row in results.rows}
     results.verdicts = [
         Verdict("floor: share that one_step, Mish 3x256 reaches", shares.get(ONE_STEP), 0.5, 0.7),
+        Verdict("floor: share that one_step, Mish 3x256 reaches, compiled", shares.get(compiled(ONE_STEP)), 0.5, 0.7),
         Verdict("floor: share that the default reaches", shares.get(DEFAULT), None),
+        Verdict("floor: share that the default reaches, compiled", shares.get(compiled(DEFAULT)), None),
         Verdict("floor: share that the exact chain, Mish 3x256 reaches", shares.get(CHAIN), None),
     ]
     results.write(COLUMNS)

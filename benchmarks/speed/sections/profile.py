@@ -6,7 +6,6 @@ import numpy as np
 
 from benchmarks.speed import contestants, plots
 from benchmarks.speed.benchmark import HALF_CHEETAH, Benchmark
-from benchmarks.speed.contestants import CHAIN, DEFAULT, ONE_STEP
 from benchmarks.speed.results import markdown
 from benchmarks.speed.workers.call_timer import OTHER, PARTS
 
@@ -19,7 +18,7 @@ def run(benchmark: Benchmark) -> None:
     :param benchmark: What is shared
     """
     results = benchmark.results("profile")
-    who = [one for one in contestants.our_settings() if one.name in (DEFAULT, ONE_STEP, CHAIN)]
+    who = contestants.main_settings()
     names = [part.name for part in PARTS] + [OTHER]
     with benchmark.field(who, transitions=benchmark.transitions(HALF_CHEETAH)) as field:
         turns = field.interleaved(benchmark.rounds, lambda worker: worker.ask("profile", n=benchmark.updates)["value"])

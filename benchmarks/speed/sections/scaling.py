@@ -7,7 +7,7 @@ import numpy as np
 from benchmarks.speed import contestants, plots
 from benchmarks.speed.benchmark import Benchmark
 from benchmarks.speed.client import Contestant, Field
-from benchmarks.speed.contestants import CHAIN, DEFAULT, DIFFUSION_QL, ONE_STEP, SAC
+from benchmarks.speed.contestants import DIFFUSION_QL, SAC
 
 BASE = {"n": 17, "d": 6, "K": 5, "batch": 256, "candidates": 10, "observations": 1}
 POINTS = {
@@ -30,7 +30,7 @@ def run(benchmark: Benchmark) -> None:
     :param benchmark: What is shared
     """
     results = benchmark.results("scaling")
-    ours = [one for one in contestants.our_settings() if one.name in (DEFAULT, ONE_STEP, CHAIN)]
+    ours = contestants.main_settings()
     who = [*ours, contestants.sb3("SAC"), *benchmark.diffusion_ql()]
     # Set up once at the base, so that who is not available is known
     transitions = benchmark.synthetic(BASE["n"], BASE["d"])

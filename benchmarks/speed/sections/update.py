@@ -5,7 +5,7 @@ from typing import Any
 from benchmarks.speed import contestants, plots
 from benchmarks.speed.benchmark import HALF_CHEETAH, HUMANOID, Benchmark
 from benchmarks.speed.client import Contestant, Field, median_ratio
-from benchmarks.speed.contestants import CHAIN, DEFAULT, DIFFUSION_QL, ONE_STEP, SAC
+from benchmarks.speed.contestants import CHAIN, DEFAULT, DIFFUSION_QL, ONE_STEP, SAC, compiled
 from benchmarks.speed.results import Results, Verdict
 
 COLUMNS = ("task", "contestant", "ms", "spread", "vs Diffusion-QL", "vs SB3 SAC", "MFLOP", "GFLOP/s", "parameters", "status")
@@ -29,17 +29,25 @@ def run(benchmark: Benchmark) -> None:
         *benchmark.diffusion_ql(),
         *benchmark.authors(),
     ]
-    ours = [one for one in contestants.our_settings() if not (args.no_compile and one.config["kwargs"].get("compile"))]
+    ours = [*benchmark.ours(contestants.main_settings()), *contestants.more_settings()]
     small = _measure(benchmark, results, HALF_CHEETAH, [*ours, *peers], benchmark.updates)
-    wide = [one for one in contestants.our_settings() if one.name in (DEFAULT, ONE_STEP, CHAIN)]
-    wide += [contestants.sb3("SAC"), *benchmark.diffusion_ql(), *benchmark.authors()]
-    large = _measure(benchmark, results, HUMANOID, wide, HUMANOID_UPDATES)
-    results.verdicts = [
-        _verdict("update: one_step, Mish, world model, vs Diffusion-QL", small, ONE_STEP, DIFFUSION_QL, 3.0, 4.5),
-        _verdict("update: exact chain, Mish, world model, vs Diffusion-QL", small, CHAIN, DIFFUSION_QL, 1.6, 2.3),
-        _verdict("update: default vs SB3 SAC 3x256", small, DEFAULT, SAC, 1.2, 1.6),
-        _verdict("update, Humanoid sizes: one_step, Mish, vs Diffusion-QL", large, ONE_STEP, DIFFUSION_QL, 2.5, 4.0),
+    wide = [
+        *benchmark.ours(contestants.main_settings()),
+        contestants.sb3("SAC"),
+        *benchmark.diffusion_ql(),
+        *benchmark.authors(),
     ]
+    large = _measure(benchmark, results, HUMANOID, wide, HUMANOID_UPDATES)
+    wanted: tuple[tuple[str, dict[str, list[float]], str, str, float, float], ...] = (
+        ("update: one_step, Mish, world model, vs Diffusion-QL", small, ONE_STEP, DIFFUSION_QL, 3.0, 4.5),
+        ("update: exact chain, Mish, world model, vs Diffusion-QL", small, CHAIN, DIFFUSION_QL, 1.6, 2.3),
+        ("update: default vs SB3 SAC 3x256", small, DEFAULT, SAC, 1.2, 1.6),
+        ("update, Humanoid sizes: one_step, Mish, vs Diffusion-QL", large, ONE_STEP, DIFFUSION_QL, 2.5, 4.0),
+    )
+    for what, taken, name, reference, must, goal in wanted:
+        results.verdicts.append(_verdict(what, taken, name, reference, must, goal))
+        if not args.no_compile:
+            results.verdicts.append(_verdict(f"{what}, compiled", taken, compiled(name), reference, must, goal))
     results.write(COLUMNS)
     plots.updates(results, HALF_CHEETAH)
 
