@@ -31,9 +31,10 @@ def compiled(function: Callable[..., Any], mode: bool | str) -> Callable[..., An
     :param mode: True, or a mode of ``torch.compile``
     :return: The function, compiled at its first call; it draws the same random numbers as the plain one
     """
-    options = {} if mode is True else th._inductor.list_mode_options(mode)  # type: ignore[arg-type]
-    graph = th.compile(
-        function, options={**options, "fallback_random": True}, isolate_recompiles=True, recompile_limit=_MOST_GRAPHS
+    options = th._inductor.list_mode_options(mode) if isinstance(mode, str) else {}
+    options["fallback_random"] = True
+    graph = th.compile(  # type: ignore[call-overload]  # the type stubs lack two arguments
+        function, options=options, isolate_recompiles=True, recompile_limit=_MOST_GRAPHS
     )
 
     @wraps(function)

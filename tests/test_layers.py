@@ -13,13 +13,13 @@ LAYERS = [
     {"__init__"},
     {"causalgdp"},
     {"callbacks"},
-    {"losses", "diagnostics", "structural"},
+    {"losses", "gradients", "diagnostics", "structural"},
     {"policies"},
     {"acting"},
     {"causal", "offline", "diffusion"},
     {"checks"},
 ]
-WITHOUT_SB3 = {"causal", "diffusion", "losses"}
+WITHOUT_SB3 = {"causal", "diffusion", "losses", "gradients"}
 LEVELS = {part: level for level, parts in enumerate(LAYERS) for part in parts}
 FILES = sorted(PACKAGE.rglob("*.py"))
 
