@@ -285,6 +285,7 @@ class CausalGDP(OfflineToOnlineAlgorithm):
         self._fed_offline_position = 0
         self._fed_marks: list[str] = []
 
+        check_compile(self.compile, self.device)
         if _init_setup_model:
             self._setup_model()
 
@@ -329,7 +330,6 @@ class CausalGDP(OfflineToOnlineAlgorithm):
 
     def _check_arguments(self) -> None:
         check_at_least_zero(eta=self.eta, denoising_weight=self.denoising_weight)
-        check_compile(self.compile)
         if self.causal_refresh_freq < 1:
             raise ValueError(f"causal_refresh_freq must be at least 1 environment step, got {self.causal_refresh_freq!r}")
         for name in ("policy_delay", "world_model_delay"):
@@ -377,6 +377,8 @@ class CausalGDP(OfflineToOnlineAlgorithm):
         update_learning_rate(_optimizer_of(self.world_model), self.world_model_lr_schedule(progress))
 
     def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
+        # Again, for models that were loaded: those that are not trained need no compiler
+        check_compile(self.compile, self.device)
         callbacks = callback_list(callback)
         n_own = sum(isinstance(one, CausalWorldModelCallback) for top in callbacks for one in _flatten(top))
         if n_own > 1:
@@ -504,6 +506,7 @@ class CausalGDP(OfflineToOnlineAlgorithm):
 
     def _gradient_steps(self, gradient_steps: int, batch_size: int) -> dict[str, list[th.Tensor]]:
         losses: dict[str, list[th.Tensor]] = {}
+        guided = self.policy.is_guided  # once, because a GPU has to be waited for
         for replay_data in self._batches(gradient_steps, batch_size):
             self._n_updates += 1
             trains_world_model = self._n_updates % self.world_model_delay == 0
@@ -521,7 +524,7 @@ class CausalGDP(OfflineToOnlineAlgorithm):
                 if one_step is not replay_data:
                     with th.no_grad():
                         next_actions = self.actor_target.sample(self.actor_target.features(one_step.next_observations))
-                step_losses.update(self._update_actor(one_step, next_actions))
+                step_losses.update(self._update_actor(one_step, next_actions, guided))
             self._update_targets()
             for name, loss in step_losses.items():
                 losses.setdefault(name, []).append(loss.detach().clone())
@@ -606,9 +609,8 @@ class CausalGDP(OfflineToOnlineAlgorithm):
         transition, reward = world_model_loss(self.world_model, *transitions)  # type: ignore[arg-type]
         return transition.detach(), reward.detach(), gradients_of(self.world_model, transition + reward)
 
-    def _update_actor(self, transitions, next_actions: th.Tensor) -> dict[str, th.Tensor]:
+    def _update_actor(self, transitions, next_actions: th.Tensor, guided: bool) -> dict[str, th.Tensor]:
         climbed = int(np.random.randint(len(self.critic.q_networks)))
-        guided = self.policy.is_guided
         denoising, q_term, loss, gradients = self._actor_gradients(transitions, next_actions, climbed, guided)
         self._step(self.actor, gradients)
         return {"actor_loss": loss, "denoising_loss": denoising, "q_loss": q_term}

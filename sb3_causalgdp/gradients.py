@@ -2,7 +2,7 @@
 
 import inspect
 from collections.abc import Callable
-from functools import wraps
+from functools import cache, wraps
 from typing import Any
 
 import torch as th
@@ -31,27 +31,35 @@ def compiled(function: Callable[..., Any], mode: bool | str) -> Callable[..., An
     :param mode: True, or a mode of ``torch.compile``
     :return: The function, compiled at its first call; it draws the same random numbers as the plain one
     """
-    options = th._inductor.list_mode_options(mode) if isinstance(mode, str) else {}
-    options["fallback_random"] = True
-    graph = th.compile(  # type: ignore[call-overload]  # the type stubs lack two arguments
-        function, options=options, isolate_recompiles=True, recompile_limit=_MOST_GRAPHS
-    )
+
+    @cache
+    def graph() -> Callable[..., Any]:
+        options = th._inductor.list_mode_options(mode) if isinstance(mode, str) else {}
+        options["fallback_random"] = True
+        return th.compile(  # type: ignore[call-overload]  # the type stubs lack two arguments
+            function, options=options, isolate_recompiles=True, recompile_limit=_MOST_GRAPHS
+        )
 
     @wraps(function)
     def call(*args: Any) -> Any:
         with th._dynamo.config.patch(trace_autograd_ops=True):
-            return graph(*args)
+            return graph()(*args)
 
     return call
 
 
-def check_compile(mode: bool | str) -> None:
+def check_compile(mode: bool | str, device: th.device) -> None:
     """
     :param mode: False, True, or a mode of ``torch.compile``
-    :raises ValueError: If the mode is unknown, or this PyTorch cannot have a backward pass in a compiled graph
+    :param device: Where the graphs would run
+    :raises ValueError: If the mode is unknown, this PyTorch cannot have a backward pass in a compiled graph, or a CPU's graphs
+        find no C++ compiler
     """
     if mode is False:
         return
+    # Two seconds, which those who do not compile need not wait
+    from torch._inductor.cpp_builder import get_cpp_compiler
+
     modes = list(th._inductor.list_mode_options())
     if mode is not True and mode not in modes:
         raise ValueError(f"compile must be True, False or one of {modes}, got {mode!r}")
@@ -60,3 +68,8 @@ def check_compile(mode: bool | str) -> None:
         raise ValueError(
             f"compile={mode!r} needs PyTorch 2.13 or newer, this is {th.__version__}; compile=False works with it"
         )
+    if device.type == "cpu":
+        try:
+            get_cpp_compiler()
+        except RuntimeError as error:
+            raise ValueError(f"compile={mode!r} needs a C++ compiler such as g++, and none was found: {error}") from error

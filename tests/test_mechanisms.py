@@ -107,7 +107,7 @@ def test_guidance_enters_the_actors_loss(trained, monkeypatch):
         th.manual_seed(0)
         with th.random.fork_rng(), monkeypatch.context() as patch:
             patch.setattr(model, "_optimize", lambda module, loss: None)
-            return float(model._update_actor(data, data.actions)["denoising_loss"])
+            return float(model._update_actor(data, data.actions, model.policy.is_guided)["denoising_loss"])
 
     guided = denoising()
     assert denoising() == guided
@@ -281,6 +281,6 @@ def test_a_gradient_step_trains_actor_critics_and_world_model_and_the_actors_los
             if any(not th.equal(old, new) for old, new in zip(before[name], module.parameters(), strict=True))
         }
 
-    assert changed_by(lambda: model._update_actor(data, data.actions)) == {"actor"}
+    assert changed_by(lambda: model._update_actor(data, data.actions, model.policy.is_guided)) == {"actor"}
     assert changed_by(lambda: model._update_critics(data)) == {"critic"}
     assert changed_by(lambda: model._update_world_model(data)) == {"world_model"}

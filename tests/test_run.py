@@ -263,9 +263,9 @@ class SpyingGDP(CausalGDP):
         self.seen["world model"].append(transitions)
         return super()._update_world_model(transitions)
 
-    def _update_actor(self, transitions, next_actions):
+    def _update_actor(self, transitions, next_actions, guided):
         self.seen["actor"].append((transitions, next_actions))
-        return super()._update_actor(transitions, next_actions)
+        return super()._update_actor(transitions, next_actions, guided)
 
 
 N_STEP_BUFFERS = [
