@@ -352,6 +352,8 @@ class CausalGDPPolicy(BasePolicy):
         self.critic_target.load_state_dict(self.critic.state_dict())
         self._check_guidance_steps()
 
+        # Here, because a compiler cannot see through flatdim()
+        self.leaf_sizes = [spaces.flatdim(space) for space in _leaf_spaces(self.observation_space)]
         self.has_image_state = any(
             is_image_space(space, normalized_image=not self.normalize_images) for space in _leaf_spaces(self.observation_space)
         )
@@ -433,7 +435,7 @@ class CausalGDPPolicy(BasePolicy):
     def _state_dim(self) -> int:
         if self.has_image_state:
             return self.critic_target.features_extractor.features_dim
-        return sum(spaces.flatdim(space) for space in _leaf_spaces(self.observation_space))
+        return sum(self.leaf_sizes)
 
     def state_names(self) -> tuple[str, ...]:
         """
@@ -471,12 +473,9 @@ class CausalGDPPolicy(BasePolicy):
         """Features of predicted states, which have no observation: the inverse of :meth:`causal_state`."""
         if not isinstance(self.observation_space, spaces.Dict):
             return extractor(_as_observation(state, self.observation_space))
-        parts, start = {}, 0
-        for key, space in self.observation_space.spaces.items():
-            size = spaces.flatdim(space)
-            parts[key] = _as_observation(state[:, start : start + size], space)
-            start += size
-        return extractor(parts)
+        named = self.observation_space.spaces.items()
+        parts = state.split(self.leaf_sizes, dim=1)
+        return extractor({key: _as_observation(part, space) for (key, space), part in zip(named, parts, strict=True)})
 
     def value_gradient(self, state: th.Tensor, action: th.Tensor, critic: int | None = None) -> th.Tensor:
         """

@@ -2,6 +2,7 @@
 
 from functools import wraps
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
@@ -22,9 +23,9 @@ KWARGS = {
 }
 
 
-def trained_model(**kwargs):
+def trained_model(policy="MlpPolicy", env="Pendulum-v1", **kwargs):
     """A model whose guidance is on, just before its next gradient step."""
-    model = CausalGDP("MlpPolicy", "Pendulum-v1", **{**KWARGS, **kwargs})
+    model = CausalGDP(policy, env, **{**KWARGS, **kwargs})
     model.learn(215)
     assert model.policy.is_guided is (kwargs.get("guidance", "posterior") is not None)
     model.policy.set_training_mode(True)
@@ -242,6 +243,13 @@ COMPILABLE = {
     "memory": {"optimize_memory_usage": True, "replay_buffer_kwargs": {"handle_timeout_termination": False}},
     "n steps": {"n_steps": 3},
 }
+
+
+def test_an_update_on_a_dictionary_of_vectors_is_one_graph_for_each_network(tmp_path, monkeypatch):
+    compile_for_tests(monkeypatch, backend="eager")
+    space = gym.spaces.Dict({"pole": gym.spaces.Box(-1.0, 1.0, (2,)), "speed": gym.spaces.Box(-8.0, 8.0, (1,))})
+    env = gym.wrappers.TransformObservation(gym.make("Pendulum-v1"), lambda x: {"pole": x[:2], "speed": x[2:]}, space)
+    assert_trains_alike(trained_model("MultiInputPolicy", env), tmp_path)
 
 
 @pytest.mark.parametrize("name", COMPILABLE)
