@@ -5,6 +5,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
+from goal_env import GoalEnv
 from gymnasium import spaces
 from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback, EvalCallback
@@ -352,35 +353,18 @@ def test_both_stages_work_with_every_kind_of_buffer(variant, arrays, tmp_path):
     assert loaded.causal_statistics.n_samples <= fed + 54
 
 
-class GoalEnv(gym.Env):
-    observation_space = spaces.Dict(
-        {key: spaces.Box(-9.0, 9.0, (2,)) for key in ("observation", "achieved_goal", "desired_goal")}
-    )
-    action_space = spaces.Box(-1.0, 1.0, (2,))
-
-    def reset(self, seed=None, options=None):
-        super().reset(seed=seed)
-        self.n_steps = 0
-        return self.observation_space.sample(), {}
-
-    def step(self, action):
-        self.n_steps += 1
-        return self.observation_space.sample(), 0.0, False, self.n_steps == 20, {}
-
-    def compute_reward(self, achieved_goal, desired_goal, info):
-        return -np.linalg.norm(achieved_goal - desired_goal, axis=-1)
-
-
 @pytest.mark.filterwarnings("ignore:.*trajectory in the replay buffer will be truncated")
 def test_hindsight_replay_takes_preloaded_batches_until_an_episode_has_ended(tmp_path):
-    first = CausalGDP("MultiInputPolicy", GoalEnv(), replay_buffer_class=HerReplayBuffer, **{**KWARGS, "learning_starts": 100})
+    first = CausalGDP(
+        "MultiInputPolicy", GoalEnv(20), replay_buffer_class=HerReplayBuffer, **{**KWARGS, "learning_starts": 100}
+    )
     first.learn(60)
-    model = CausalGDP("MultiInputPolicy", GoalEnv(), replay_buffer_class=HerReplayBuffer, **KWARGS)
+    model = CausalGDP("MultiInputPolicy", GoalEnv(20), replay_buffer_class=HerReplayBuffer, **KWARGS)
     model.preload(first.replay_buffer).pretrain(2).learn(12)
     assert model._n_updates == 2 + 7
     model.save(tmp_path / "model")
     model.save_replay_buffer(tmp_path / "buffer")
-    loaded = CausalGDP.load(tmp_path / "model", env=GoalEnv(), device="cpu")
+    loaded = CausalGDP.load(tmp_path / "model", env=GoalEnv(20), device="cpu")
     loaded.load_replay_buffer(tmp_path / "buffer")
     loaded.learn(30, reset_num_timesteps=False)
     assert loaded.offline_buffer.size() == 60

@@ -4,6 +4,7 @@ import warnings
 import gymnasium as gym
 import numpy as np
 import pytest
+from goal_env import GOALS, GoalEnv
 from gymnasium import spaces
 from stable_baselines3 import SAC, HerReplayBuffer
 from stable_baselines3.common.buffers import ReplayBuffer
@@ -28,25 +29,7 @@ KWARGS = {
 }
 PENDULUM = gym.make("Pendulum-v1")
 OBSERVATIONS, ACTIONS = PENDULUM.observation_space, PENDULUM.action_space
-GOALS = spaces.Dict({key: spaces.Box(-9.0, 9.0, (2,), np.float64) for key in ("observation", "achieved_goal", "desired_goal")})
 LENGTHS = (5, 3, 7)
-
-
-class GoalEnv(gym.Env):
-    observation_space = GOALS
-    action_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
-
-    def reset(self, seed=None, options=None):
-        super().reset(seed=seed)
-        self.n_steps = 0
-        return self.observation_space.sample(), {}
-
-    def step(self, action):
-        self.n_steps += 1
-        return self.observation_space.sample(), 0.0, False, self.n_steps == 5, {}
-
-    def compute_reward(self, achieved_goal, desired_goal, info):
-        return -np.linalg.norm(achieved_goal - desired_goal, axis=-1)
 
 
 def episode(length, seed, terminates, observation_space=OBSERVATIONS, action_space=ACTIONS):
