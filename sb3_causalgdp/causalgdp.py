@@ -310,7 +310,7 @@ class CausalGDP(OfflineToOnlineAlgorithm):
     def _setup_compile(self) -> None:
         for name in COMPILED:
             function = getattr(type(self), name).__get__(self)
-            setattr(self, name, compiled(function, self.compile) if self.compile else function)
+            setattr(self, name, compiled(function, self.compile, self.device) if self.compile else function)
 
     def _setup_discovery(self) -> None:
         self.discovery = make_discovery(self.causal_discovery, **self.causal_discovery_kwargs)

@@ -25,17 +25,19 @@ def gradients_of(module: th.nn.Module, loss: th.Tensor) -> Gradients:
     return tuple(next(gradients) if parameter.requires_grad else None for parameter in module.parameters())
 
 
-def compiled(function: Callable[..., Any], mode: bool | str) -> Callable[..., Any]:
+def compiled(function: Callable[..., Any], mode: bool | str, device: th.device) -> Callable[..., Any]:
     """
     :param function: What to compile; it may take gradients, which become part of the graph
     :param mode: True, or a mode of ``torch.compile``
+    :param device: Where its tensors are
     :return: The function, compiled at its first call; it draws the same random numbers as the plain one
     """
 
     @cache
     def graph() -> Callable[..., Any]:
         options = th._inductor.list_mode_options(mode) if isinstance(mode, str) else {}
-        options["fallback_random"] = True
+        # On a CPU the calls between the kernels are compiled, too: a twentieth of an update
+        options |= {"fallback_random": True, "cpp_wrapper": device.type == "cpu"}
         return th.compile(  # type: ignore[call-overload]  # the type stubs lack two arguments
             function, options=options, isolate_recompiles=True, recompile_limit=_MOST_GRAPHS
         )
