@@ -126,7 +126,7 @@ class CausalGDP(OfflineToOnlineAlgorithm):
         :class:`~sb3_causalgdp.policies.CausalGDPPolicy`
     :param compile: Whether to compile with ``torch.compile``, or its ``mode``, such as ``"reduce-overhead"`` for CUDA graphs:
         one graph for the loss and the gradients of each network, with the world model and the guidance in it. The first
-        updates then take a minute or two; results and random numbers are the same. Saved models do not depend on it. Needs
+        updates then take a minute or two; the numbers are the same up to rounding. Saved models do not depend on it. Needs
         PyTorch 2.13 and, on a CPU, a C++ compiler
     :param torch_threads: PyTorch's number of CPU threads during updates; None leaves it as it is. ``"auto"`` is 1 where
         observations are vectors, whose networks are so small that threads only wait for each other, and otherwise None
