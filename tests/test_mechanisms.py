@@ -106,7 +106,7 @@ def test_guidance_enters_the_actors_loss(trained, monkeypatch):
     def denoising():
         th.manual_seed(0)
         with th.random.fork_rng(), monkeypatch.context() as patch:
-            patch.setattr(model, "_optimize", lambda module, loss: None)
+            patch.setattr(model, "_step", lambda module, gradients: None)
             return float(model._update_actor(data, data.actions, model.policy.is_guided)["denoising_loss"])
 
     guided = denoising()
