@@ -527,7 +527,7 @@ class CausalGDP(OfflineToOnlineAlgorithm):
                 step_losses.update(self._update_actor(one_step, next_actions, guided))
             self._update_targets()
             for name, loss in step_losses.items():
-                losses.setdefault(name, []).append(loss.detach().clone())
+                losses.setdefault(name, []).append(loss.clone())
         return losses
 
     def _n_threads(self) -> int | None:
@@ -647,12 +647,13 @@ class CausalGDP(OfflineToOnlineAlgorithm):
         return denoising, q_loss(values, scale)
 
     def _step(self, module: th.nn.Module, gradients: Gradients) -> None:
-        for parameter, gradient in zip(module.parameters(), gradients, strict=True):
+        parameters = list(module.parameters())
+        for parameter, gradient in zip(parameters, gradients, strict=True):
             parameter.grad = gradient
         if self.max_grad_norm is not None and module is not self.world_model:
-            th.nn.utils.clip_grad_norm_(module.parameters(), self.max_grad_norm)
+            th.nn.utils.clip_grad_norm_(parameters, self.max_grad_norm)
         _optimizer_of(module).step()
-        for parameter in module.parameters():
+        for parameter in parameters:
             # A CUDA graph may write over what it returned
             parameter.grad = None
 

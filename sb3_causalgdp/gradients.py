@@ -20,9 +20,10 @@ def gradients_of(module: th.nn.Module, loss: th.Tensor) -> Gradients:
     :param loss: Scalar
     :return: The loss's gradient by each of the module's parameters, in their order; no other parameter's is computed
     """
-    trained = [parameter for parameter in module.parameters() if parameter.requires_grad]
+    parameters = list(module.parameters())
+    trained = [parameter for parameter in parameters if parameter.requires_grad]
     gradients = iter(th.autograd.grad(loss, trained, allow_unused=True))
-    return tuple(next(gradients) if parameter.requires_grad else None for parameter in module.parameters())
+    return tuple(next(gradients) if parameter.requires_grad else None for parameter in parameters)
 
 
 def compiled(function: Callable[..., Any], mode: bool | str, device: th.device) -> Callable[..., Any]:

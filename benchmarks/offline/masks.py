@@ -14,7 +14,6 @@ import torch as th
 
 from benchmarks.offline.data import ensure_dataset, transitions
 from sb3_causalgdp.causal import MaskedWorldModel
-from sb3_causalgdp.gradients import gradients_of
 from sb3_causalgdp.losses import world_model_loss
 
 TASK = "maze2d-umaze"
@@ -44,8 +43,8 @@ def responses(arrays: dict[str, th.Tensor], mask: float, updates: Sequence[int],
         reward = arrays["rewards"][rows].flatten()
         model.update_statistics(state, next_state, reward)
         loss = sum(world_model_loss(model, state, action, next_state, reward), start=th.zeros(()))
-        for parameter, gradient in zip(model.parameters(), gradients_of(model, loss), strict=True):
-            parameter.grad = gradient
+        optimizer.zero_grad()
+        loss.backward()
         optimizer.step()
         if update in updates:
             tested = (arrays[name][:TESTED] for name in ("observations", "actions"))

@@ -103,7 +103,7 @@ class CausalGuidance:
         :param action: Clean actions, shape ``(batch, d)``
         :return: Gradient, shape ``(batch, d)``, and curvature, shape ``(batch, d, d)``
         """
-        # A no_grad() as a decorator of a method cannot be compiled
+        # Not as a decorator, which cannot be compiled for an object that is made inside the graph
         with th.no_grad():
             return self.at(self.world_model.action_response(self.state, action))
 
