@@ -200,6 +200,7 @@ class CausalGDP(OfflineToOnlineAlgorithm):
         causal_refresh_freq: int = 1_000,
         causal_half_life: float | None = None,
         causal_window: int | None = None,
+        sample_masks: bool = True,
         offline_dataset: str | None = None,
         pretrain_steps: int = 0,
         offline_fraction: float | Schedule = 0.5,
@@ -270,6 +271,7 @@ class CausalGDP(OfflineToOnlineAlgorithm):
         self.causal_refresh_freq = causal_refresh_freq
         self.causal_half_life = causal_half_life
         self.causal_window = causal_window
+        self.sample_masks = sample_masks
         self.compile = compile
         self.torch_threads = torch_threads
         # What is known of the causal structure, saved with the model
@@ -606,7 +608,7 @@ class CausalGDP(OfflineToOnlineAlgorithm):
         return {"world_model_transition_loss": transition, "world_model_reward_loss": reward}
 
     def _world_model_gradients(self, *transitions: th.Tensor | None) -> tuple[th.Tensor, th.Tensor, Gradients]:
-        transition, reward = world_model_loss(self.world_model, *transitions)  # type: ignore[arg-type]
+        transition, reward = world_model_loss(self.world_model, *transitions, sample_masks=self.sample_masks)  # type: ignore[arg-type]
         return transition.detach(), reward.detach(), gradients_of(self.world_model, transition + reward)
 
     def _update_actor(self, transitions, next_actions: th.Tensor, guided: bool) -> dict[str, th.Tensor]:

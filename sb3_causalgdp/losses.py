@@ -93,6 +93,7 @@ def world_model_loss(
     next_state: th.Tensor,
     reward: th.Tensor,
     weight: th.Tensor | None = None,
+    sample_masks: bool = False,
 ) -> tuple[th.Tensor, th.Tensor]:
     """
     :param world_model: The masked world model
@@ -101,9 +102,10 @@ def world_model_loss(
     :param next_state: Shape ``(batch, n)``
     :param reward: Shape ``(batch,)``
     :param weight: Weights of the transitions, 0 where the next state is not known, shape ``(batch,)``
+    :param sample_masks: Whether the masks are probabilities of edges, and which edges are there is drawn
     :return: Negative log likelihoods of the transition model (per variable) and of the reward model, means over the batch
     """
-    transition, reward_term = world_model.negative_log_likelihood(state, action, next_state, reward)
+    transition, reward_term = world_model.negative_log_likelihood(state, action, next_state, reward, sample_masks)
     if weight is None:
         return transition.mean(), reward_term.mean()
     total = weight.sum().clamp(min=1.0)

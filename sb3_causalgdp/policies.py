@@ -24,7 +24,7 @@ from sb3_causalgdp.causal.guidance import OutcomeTarget
 from sb3_causalgdp.checks import check_at_least_zero
 from sb3_causalgdp.diffusion import Guidance, GuidanceRule, MLPDenoiser, NoiseSchedule, sample
 from sb3_causalgdp.diffusion.activations import fast
-from sb3_causalgdp.diffusion.samplers import check_sampler
+from sb3_causalgdp.diffusion.samplers import bind, check_sampler
 
 ACTIVATIONS: dict[str, type[nn.Module]] = {
     "mish": nn.Mish,
@@ -104,6 +104,9 @@ class DiffusionActor(BasePolicy):
     :param ddim_eta: Noise of DDIM, in [0, 1]
     """
 
+    # Noise's share of the variance from which an action is adapted to a state near by
+    ADAPTING_NOISE = 0.1
+
     def __init__(
         self,
         observation_space: spaces.Space,
@@ -133,6 +136,8 @@ class DiffusionActor(BasePolicy):
         self.sampler = sampler
         self.ddim_eta = ddim_eta
         self.schedule = NoiseSchedule(noise_schedule, diffusion_steps)
+        noisy_enough = (i for i, signal in enumerate(self.schedule.alpha_bar_list) if 1.0 - signal >= self.ADAPTING_NOISE)
+        self.adapting_step = next(noisy_enough, self.schedule.n_steps - 1)
         self.denoiser = MLPDenoiser(self.action_dim, features_dim, diffusion_steps, net_arch, activation_fn)
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
@@ -185,6 +190,19 @@ class DiffusionActor(BasePolicy):
             eta=self.ddim_eta,
             divergences=divergences,
         )
+
+    def adapt(self, features: th.Tensor, action: th.Tensor) -> th.Tensor:
+        """
+        Turn an action for one state into one for a state near by: the clean estimate at the diffusion step where little noise
+        is left, from the action as it is there without noise.
+
+        :param features: Of the state near by, shape ``(batch, features_dim)``
+        :param action: Shape ``(batch, d)``
+        :return: Actions in [-1, 1], shape ``(batch, d)``
+        """
+        step = th.full((len(action),), self.adapting_step, device=action.device)
+        noisy = self.schedule.add_noise(action, th.zeros_like(action), step)
+        return self.schedule.clean_estimate(noisy, bind(self.denoiser, features)(noisy, step), step).clamp(-1.0, 1.0)
 
     def forward(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         features = self.features(observation)
@@ -342,6 +360,9 @@ class CausalGDPPolicy(BasePolicy):
 
     def _build(self, lr_schedule: Schedule) -> None:
         self._acting: NumpyActing | None = None
+        self.register_buffer("reward_target", th.zeros(()))
+        self.register_buffer("return_std", th.ones(()))
+        self.register_buffer("guidance_ready", th.zeros(()))
         self.actor = self.make_actor()
         self.actor_target = self.make_actor()
         self.actor_target.load_state_dict(self.actor.state_dict())
@@ -358,9 +379,6 @@ class CausalGDPPolicy(BasePolicy):
             is_image_space(space, normalized_image=not self.normalize_images) for space in _leaf_spaces(self.observation_space)
         )
         self.world_model = MaskedWorldModel(self._state_dim(), self.actor.action_dim, self.world_model_net_arch)
-        self.register_buffer("reward_target", th.zeros(()))
-        self.register_buffer("return_std", th.ones(()))
-        self.register_buffer("guidance_ready", th.zeros(()))
         self.register_buffer("candidate_noise", self._fixed_candidate_noise(), persistent=False)
 
         optimizer_kwargs = self.optimizer_kwargs
@@ -416,6 +434,12 @@ class CausalGDPPolicy(BasePolicy):
             **self.guidance_kwargs,
         )
         return data
+
+    @property
+    def device(self) -> th.device:
+        """Where the policy is."""
+        # SB3 looks for the first parameter of all modules, two or three times a prediction
+        return self.return_std.device
 
     def set_training_mode(self, mode: bool) -> None:
         """
@@ -537,8 +561,8 @@ class CausalGDPPolicy(BasePolicy):
         next_action = action
         if self.guidance_target == "return" and not self.has_image_state:
             features = self._features_of_state(next_state, self.actor.features_extractor)
-            noise = th.zeros(self.actor.schedule.n_steps, *action.shape, dtype=action.dtype, device=action.device)
-            next_action = self.actor.sample(features, noise)
+            # The next state is near: one step of the denoiser stands for a chain
+            next_action = self.actor.adapt(features, action)
         return LinearisedGuidance(self.make_guidance(state, next_state, next_action), action, response)
 
     # Prediction ---------------------------------------------------------------------------------------------------------

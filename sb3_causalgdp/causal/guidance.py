@@ -5,7 +5,7 @@ from typing import NamedTuple, Protocol
 
 import torch as th
 
-from sb3_causalgdp.causal.world_model import ActionResponse, MaskedWorldModel
+from sb3_causalgdp.causal.world_model import ActionResponse, MaskedWorldModel, through
 from sb3_causalgdp.checks import check_at_least_zero
 
 
@@ -61,8 +61,7 @@ class ReturnTarget:
         self.std = std
 
     def __call__(self, response: ActionResponse) -> OutcomeTerm:
-        by_state = self.value_gradient(response.next_state)
-        through_value = (by_state.unsqueeze(2) * response.next_state_jacobian).sum(dim=1)
+        through_value = through(self.value_gradient(response.next_state), response.next_state_jacobian)
         jacobian = (response.reward_jacobian + self.discount * through_value) / self.std
         return OutcomeTerm(th.ones_like(response.reward), jacobian)
 
@@ -118,7 +117,7 @@ class CausalGuidance:
         if self.state_scale > 0.0:
             error = (self.next_state - response.next_state) / response.next_state_std
             jacobian = response.next_state_jacobian / response.next_state_std.unsqueeze(1)
-            gradient = gradient + self.state_scale * (error.unsqueeze(2) * jacobian).sum(dim=1)
+            gradient = gradient + self.state_scale * through(error, jacobian)
             curvature = curvature + self.state_scale * (jacobian.mT @ jacobian)
         return gradient, curvature
 

@@ -4,7 +4,6 @@ import math
 from typing import NamedTuple
 
 import torch as th
-import torch.nn.functional as F
 from torch import nn
 
 
@@ -22,9 +21,6 @@ class MaskedBlocks(nn.Module):
     :param width: Hidden units w of one block
     :param depth: Number of hidden layers, at least 1
     """
-
-    # Up to here one batched product is faster than one large product and a transposition
-    FEW_INPUTS = 64
 
     def __init__(self, n_inputs: int, n_outputs: int, width: int, depth: int) -> None:
         super().__init__()
@@ -46,11 +42,8 @@ class MaskedBlocks(nn.Module):
         return self.input_layer.weight.view(self.n_outputs, self.width, -1) * mask.unsqueeze(1)
 
     def _first_layer(self, inputs: th.Tensor, weight: th.Tensor) -> th.Tensor:
-        bias = self.input_layer.bias
-        if inputs.shape[1] <= self.FEW_INPUTS:
-            return th.baddbmm(bias.view(self.n_outputs, 1, self.width), inputs.expand(self.n_outputs, -1, -1), weight.mT)
-        hidden = F.linear(inputs, weight.flatten(0, 1), bias)
-        return hidden.view(-1, self.n_outputs, self.width).transpose(0, 1).contiguous()
+        bias = self.input_layer.bias.view(self.n_outputs, 1, self.width)
+        return th.baddbmm(bias, inputs.expand(self.n_outputs, -1, -1), weight.mT)
 
     def _hidden_layers(self, inputs: th.Tensor, weight: th.Tensor) -> list[th.Tensor]:
         """Each of shape ``(m, batch, w)``: in this order, no product of the forward and backward pass needs a copy."""
@@ -73,25 +66,66 @@ class MaskedBlocks(nn.Module):
         return self._outputs(self._hidden_layers(inputs, self._masked_input_weight(mask))[-1])
 
     @th.no_grad()
-    def forward_and_jacobian(self, inputs: th.Tensor, mask: th.Tensor, columns: slice) -> tuple[th.Tensor, th.Tensor]:
+    def forward_and_jacobian(
+        self, inputs: th.Tensor, mask: th.Tensor, columns: slice, scale: th.Tensor
+    ) -> tuple[th.Tensor, th.Tensor]:
         """
         :param inputs: Shape ``(batch, p)``
         :param mask: Shape ``(m, p)``
         :param columns: The inputs by which to differentiate, q of them
+        :param scale: What the outputs are multiplied with before they are differentiated, shape ``(m, 1)``
         :return: The outputs, shape ``(batch, m)``, and their Jacobian, shape ``(batch, m, q)``, both without a graph
         """
         weight = self._masked_input_weight(mask)
         layers = self._hidden_layers(inputs, weight)
+        return self._outputs(layers[-1]), self._input_jacobian(layers, weight[:, :, columns], scale * self.output_weight)
+
+    def _input_jacobian(self, layers: list[th.Tensor], input_weight: th.Tensor, output_weight: th.Tensor) -> th.Tensor:
         # Each hidden unit belongs to one output: back-propagating all outputs at once keeps their derivatives apart
-        gradient = _through_tanh(self.output_weight.unsqueeze(1), layers[-1])
+        gradient = _through_tanh(output_weight.unsqueeze(1), layers[-1])
         for hidden_weight, hidden in zip(reversed(list(self.hidden_weights)), reversed(layers[:-1]), strict=True):
             gradient = _through_tanh(th.bmm(gradient, hidden_weight.mT), hidden)
-        return self._outputs(layers[-1]), th.bmm(gradient, weight[:, :, columns]).transpose(0, 1)
+        return th.bmm(gradient, input_weight).transpose(0, 1)
+
+
+class ManyMaskedBlocks(MaskedBlocks):
+    """
+    The same where blocks are many and narrow: the batch is the last dimension of the hidden layers, shape ``(m, w, batch)``,
+    so that the first one is one large product that no transposition follows, and the others can be vectorised.
+    """
+
+    def _hidden_layers(self, inputs: th.Tensor, weight: th.Tensor) -> list[th.Tensor]:
+        first = th.addmm(self.input_layer.bias.unsqueeze(1), weight.flatten(0, 1), inputs.t())
+        layers = [first.view(self.n_outputs, self.width, -1).tanh_()]
+        for hidden_weight, bias in zip(self.hidden_weights, self.hidden_biases, strict=True):
+            layers.append(th.baddbmm(bias.mT, hidden_weight.mT, layers[-1]).tanh_())
+        return layers
+
+    def _outputs(self, hidden: th.Tensor) -> th.Tensor:
+        # Of batched products with one row each, PyTorch makes as many calls
+        return ((hidden * self.output_weight.unsqueeze(2)).sum(dim=1) + self.output_bias.unsqueeze(1)).t()
+
+    def _input_jacobian(self, layers: list[th.Tensor], input_weight: th.Tensor, output_weight: th.Tensor) -> th.Tensor:
+        gradient = _through_tanh(output_weight.unsqueeze(2), layers[-1])
+        for hidden_weight, hidden in zip(reversed(list(self.hidden_weights)), reversed(layers[:-1]), strict=True):
+            gradient = _through_tanh(th.bmm(hidden_weight, gradient), hidden)
+        return th.bmm(gradient.mT, input_weight).transpose(0, 1)
 
 
 def _through_tanh(gradient: th.Tensor, output: th.Tensor) -> th.Tensor:
     """``gradient (1 - output^2)`` in one pass over the memory."""
     return th.ops.aten.tanh_backward(gradient, output)
+
+
+def through(gradient: th.Tensor, jacobian: th.Tensor) -> th.Tensor:
+    """
+    The chain rule.
+
+    :param gradient: Shape ``(batch, n)``
+    :param jacobian: Shape ``(batch, n, d)``
+    :return: Shape ``(batch, d)``
+    """
+    return (gradient.unsqueeze(1) @ jacobian).squeeze(1)
 
 
 class ActionResponse(NamedTuple):
@@ -137,6 +171,7 @@ class MaskedWorldModel(nn.Module):
     # Running statistics stop averaging over the whole past after this many batches, so that they follow the policy
     STATISTICS_WINDOW = 1_000
     INPUT_BOUND = 10.0
+    MANY_STATES = 64  # from where ManyMaskedBlocks are faster
     LOG_STD_BOUNDS = (-5.0, 2.0)
 
     state_to_state: th.Tensor
@@ -160,7 +195,8 @@ class MaskedWorldModel(nn.Module):
         width, depth = net_arch[0], len(net_arch)
         # A multiple of 8, for which the batched products of small matrices are fastest
         block_width = min(width, max(8, 8 * round(width / math.sqrt(state_dim) / 8)))
-        self.transition = MaskedBlocks(state_dim + action_dim, state_dim, block_width, depth)
+        blocks = ManyMaskedBlocks if state_dim >= self.MANY_STATES else MaskedBlocks
+        self.transition = blocks(state_dim + action_dim, state_dim, block_width, depth)
         self.reward = MaskedBlocks(state_dim + action_dim, 1, width, depth)
         self.transition_log_std = nn.Parameter(th.zeros(state_dim))
         self.reward_log_std = nn.Parameter(th.zeros(()))
@@ -271,9 +307,12 @@ class MaskedWorldModel(nn.Module):
         :param action: a in [-1, 1], shape ``(batch, d)``
         :return: Mean, shape ``(batch, n)``, and standard deviation, shape ``(n,)``, of s'
         """
+        return self._next_state(state, action, self._transition_mask())
+
+    def _next_state(self, state: th.Tensor, action: th.Tensor, mask: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         standardised, inputs = self._network_input(state, action)
         residual_std = self.residual_std
-        change = residual_std * self.transition(inputs, self._transition_mask())
+        change = residual_std * self.transition(inputs, mask)
         mean = self.state_to_state.diagonal() * standardised + change
         std = self._bounded(self.transition_log_std).exp() * residual_std * self.state_std
         return self.state_mean + self.state_std * mean, std
@@ -284,12 +323,20 @@ class MaskedWorldModel(nn.Module):
         :param action: a in [-1, 1], shape ``(batch, d)``
         :return: Mean, shape ``(batch,)``, and standard deviation, shape ``()``, of r
         """
+        return self._reward(next_state, action, self._reward_mask())
+
+    def _reward(self, next_state: th.Tensor, action: th.Tensor, mask: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         _, inputs = self._network_input(next_state, action)
-        mean = self.reward(inputs, self._reward_mask()).squeeze(1)
+        mean = self.reward(inputs, mask).squeeze(1)
         return self.reward_mean + self.reward_scale * mean, self._bounded(self.reward_log_std).exp() * self.reward_scale
 
     def negative_log_likelihood(
-        self, state: th.Tensor, action: th.Tensor, next_state: th.Tensor, reward: th.Tensor
+        self,
+        state: th.Tensor,
+        action: th.Tensor,
+        next_state: th.Tensor,
+        reward: th.Tensor,
+        sample_masks: bool = False,
     ) -> tuple[th.Tensor, th.Tensor]:
         """
         Of one-step transitions, in standardised units, without the constant.
@@ -298,10 +345,15 @@ class MaskedWorldModel(nn.Module):
         :param action: Shape ``(batch, d)``
         :param next_state: Shape ``(batch, n)``
         :param reward: Shape ``(batch,)``
+        :param sample_masks: Whether a mask is the probability that its edge is there, and which edges are is drawn anew
         :return: That of the transition model, per variable, shape ``(batch,)``, and that of the reward model, ``(batch,)``
         """
-        next_mean, next_std = self.predict_next_state(state, action)
-        reward_mean, reward_std = self.predict_reward(next_state, action)
+        masks = self._transition_mask(), self._reward_mask()
+        if sample_masks:
+            # Exact at 0 and 1: a uniform number is below 1 and not below 0
+            masks = tuple((th.rand_like(mask) < mask).to(mask.dtype) for mask in masks)
+        next_mean, next_std = self._next_state(state, action, masks[0])
+        reward_mean, reward_std = self._reward(next_state, action, masks[1])
         transition = 0.5 * ((next_state - next_mean) / next_std).square() + self._bounded(self.transition_log_std)
         reward_term = 0.5 * ((reward - reward_mean) / reward_std).square() + self._bounded(self.reward_log_std)
         return transition.mean(dim=1), reward_term
@@ -318,20 +370,22 @@ class MaskedWorldModel(nn.Module):
         standardised, inputs = self._network_input(state, action)
         residual_std, state_std = self.residual_std, self.state_std
         actions = slice(self.state_dim, None)
-        change, jacobian = self.transition.forward_and_jacobian(inputs, self._transition_mask(), actions)
+        # Humanoid's Jacobians fill megabytes: no pass over them that is not needed
+        scale = (residual_std * state_std).unsqueeze(1)
+        change, jacobian = self.transition.forward_and_jacobian(inputs, self._transition_mask(), actions, scale)
         next_standardised = self.state_to_state.diagonal() * standardised + residual_std * change
-        next_jacobian = residual_std.unsqueeze(1) * jacobian
         reward_inputs = th.cat([next_standardised.clamp(-self.INPUT_BOUND, self.INPUT_BOUND), action], dim=1)
-        reward, reward_gradient = self.reward.forward_and_jacobian(reward_inputs, self._reward_mask(), slice(None))
+        reward, reward_gradient = self.reward.forward_and_jacobian(
+            reward_inputs, self._reward_mask(), slice(None), self.reward_scale
+        )
         reward_gradient = reward_gradient.squeeze(1)
         by_next_state, by_action = reward_gradient[:, : self.state_dim], reward_gradient[:, self.state_dim :]
-        by_next_state = by_next_state * (next_standardised.abs() <= self.INPUT_BOUND)
-        total = by_action + (by_next_state.unsqueeze(2) * next_jacobian).sum(dim=1)
+        by_next_state = by_next_state * (next_standardised.abs() <= self.INPUT_BOUND) / state_std
         return ActionResponse(
             next_state=self.state_mean + state_std * next_standardised,
             next_state_std=self._bounded(self.transition_log_std).exp() * residual_std * state_std,
-            next_state_jacobian=state_std.unsqueeze(1) * next_jacobian,
+            next_state_jacobian=jacobian,
             reward=self.reward_mean + self.reward_scale * reward.squeeze(1),
             reward_std=self._bounded(self.reward_log_std).exp() * self.reward_scale,
-            reward_jacobian=self.reward_scale * total,
+            reward_jacobian=by_action + through(by_next_state, jacobian),
         )

@@ -4,7 +4,7 @@ import pytest
 import torch as th
 from torch.autograd.functional import jacobian
 
-from sb3_causalgdp.causal.world_model import MaskedBlocks, MaskedWorldModel
+from sb3_causalgdp.causal.world_model import ManyMaskedBlocks, MaskedBlocks, MaskedWorldModel
 
 N, D = 5, 3
 
@@ -153,18 +153,74 @@ def test_masks_of_a_wrong_shape_or_range_are_refused_and_nothing_is_written(posi
 # Jacobians --------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("blocks_class", [MaskedBlocks, ManyMaskedBlocks])
 @pytest.mark.parametrize("depth", [1, 3])
 @pytest.mark.parametrize("columns", [slice(None), slice(2, None), slice(0, 2)])
-def test_blocks_give_their_outputs_and_their_jacobian(depth, columns):
+def test_blocks_give_their_outputs_and_their_jacobian(blocks_class, depth, columns):
     th.manual_seed(0)
-    blocks, inputs, mask = MaskedBlocks(4, 3, 8, depth), th.randn(6, 4), th.rand(3, 4)
-    outputs, ours = blocks.forward_and_jacobian(inputs, mask, columns)
+    blocks, inputs, mask = blocks_class(4, 3, 8, depth), th.randn(6, 4), th.rand(3, 4)
+    scale = th.tensor([[1.0], [0.1], [20.0]])
+    outputs, ours = blocks.forward_and_jacobian(inputs, mask, columns, scale)
     th.testing.assert_close(outputs, blocks(inputs, mask))
     for row in range(6):
-        expected = jacobian(lambda x: blocks(x[None], mask)[0], inputs[row])
+        expected = scale * jacobian(lambda x: blocks(x[None], mask)[0], inputs[row])
         th.testing.assert_close(ours[row], expected[:, columns])
     assert not outputs.requires_grad and not ours.requires_grad
     assert all(parameter.grad is None for parameter in blocks.parameters())
+
+
+def test_many_blocks_are_the_same_function_with_the_same_gradients():
+    th.manual_seed(0)
+    few, many = MaskedBlocks(4, 3, 8, 3), ManyMaskedBlocks(4, 3, 8, 3)
+    many.load_state_dict(few.state_dict())
+    inputs, mask, target = th.randn(6, 4), th.rand(3, 4), th.randn(6, 3)
+    outputs = [blocks(inputs, mask) for blocks in (few, many)]
+    th.testing.assert_close(*outputs)
+    losses = [(output - target).square().mean() for output in outputs]
+    gradients = [th.autograd.grad(loss, blocks.parameters()) for loss, blocks in zip(losses, (few, many), strict=True)]
+    for theirs, ours in zip(*gradients, strict=True):
+        th.testing.assert_close(ours, theirs)
+
+
+def test_a_world_of_many_states_has_blocks_for_many():
+    assert type(MaskedWorldModel(MaskedWorldModel.MANY_STATES, 2).transition) is ManyMaskedBlocks
+    assert type(MaskedWorldModel(MaskedWorldModel.MANY_STATES - 1, 2).transition) is MaskedBlocks
+
+
+# Masks as probabilities -------------------------------------------------------------------------------------------------
+
+
+def learned_response(mask, sample_masks):
+    """The model's derivative of s' = s + a by the action, after training with this mask of the action."""
+    th.manual_seed(0)
+    model = MaskedWorldModel(1, 1, [16])
+    model.set_masks(th.ones(1, 1), th.full((1, 1), mask), th.ones(1), th.ones(1))
+    optimizer = th.optim.Adam(model.parameters(), lr=1e-2)
+    for _ in range(400):
+        state, action = th.randn(64, 1), 2.0 * th.rand(64, 1) - 1.0
+        model.update_statistics(state, state + action, action[:, 0])
+        transition, reward = model.negative_log_likelihood(state, action, state + action, action[:, 0], sample_masks)
+        optimizer.zero_grad()
+        (transition + reward).mean().backward()
+        optimizer.step()
+    return model.action_response(th.zeros(8, 1), th.linspace(-0.5, 0.5, 8)[:, None]).next_state_jacobian.mean().item()
+
+
+def test_what_is_learned_makes_up_for_a_mask_that_scales_but_not_for_one_that_is_drawn():
+    assert learned_response(0.2, sample_masks=False) > 0.9
+    assert learned_response(0.2, sample_masks=True) < 0.5
+    assert learned_response(1.0, sample_masks=True) > 0.9
+    assert learned_response(0.0, sample_masks=True) == 0.0
+
+
+def test_a_mask_of_0_or_1_is_never_drawn_otherwise():
+    masks = [(mask > 0.0).float() for mask in random_masks(1)]
+    model, states, actions = make(0, masks)
+    arguments = states, actions, states + 0.1, states[:, 0]
+    expected = model.negative_log_likelihood(*arguments)
+    for _ in range(20):
+        for theirs, ours in zip(expected, model.negative_log_likelihood(*arguments, sample_masks=True), strict=True):
+            assert th.equal(ours, theirs)
 
 
 @pytest.mark.parametrize("masked", [False, True])
