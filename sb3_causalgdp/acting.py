@@ -32,7 +32,7 @@ def _constant(value: float) -> np.ndarray:
 
 
 _ZERO, _ONE, _MINUS_ONE = _constant(0.0), _constant(1.0), _constant(-1.0)
-_ROUNDING = _constant(8.0 * np.finfo(np.float32).eps)
+_ROUNDING = _constant(8.0 * float(np.finfo(np.float32).eps))
 _SMALLEST_STD, _MOST_CHANGE = _constant(1e-4), _constant(4.0)  # those of MaskedWorldModel
 
 
@@ -229,8 +229,9 @@ class _Denoiser:
         """
         action, n_steps = noise[0], len(noise)
         for position, (k, step) in enumerate(reversed(list(enumerate(self.steps)))):
-            is_known = position == 0 and first_prediction is not None
-            predicted = first_prediction if is_known else self.predict_noise(action, bound[k])
+            predicted = first_prediction if position == 0 else None
+            if predicted is None:
+                predicted = self.predict_noise(action, bound[k])
             clean = step.clean(action, predicted)
             if shift is not None:
                 clean += step.clean_by_noise * shift(_clip_action(clean), k)

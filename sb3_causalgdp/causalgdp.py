@@ -110,6 +110,9 @@ class CausalGDP(OfflineToOnlineAlgorithm):
     :param causal_half_life: Half-life, in transitions, of the statistics from which the graph is found; None forgets nothing
     :param causal_window: Number of newest transitions from which the graph is found (the paper's temporal window); None takes
         all
+    :param sample_masks: How the world model trains on its masks. True: as probabilities, which edges are there is drawn anew
+        for each batch, so that an improbable edge carries little. False: as factors of the inputs, which what is learned
+        behind them makes up for unless they are 0
     :param offline_dataset: Id of a Minari dataset, or path of a saved replay buffer or of arrays, that is preloaded when
         training starts and no transitions are there; so a loaded model, whose buffer is empty, loads it again
     :param pretrain_steps: Gradient steps of :meth:`pretrain` before the first step of ``learn()``; those that were made
@@ -607,8 +610,10 @@ class CausalGDP(OfflineToOnlineAlgorithm):
         self._step(self.world_model, gradients)
         return {"world_model_transition_loss": transition, "world_model_reward_loss": reward}
 
-    def _world_model_gradients(self, *transitions: th.Tensor | None) -> tuple[th.Tensor, th.Tensor, Gradients]:
-        transition, reward = world_model_loss(self.world_model, *transitions, sample_masks=self.sample_masks)  # type: ignore[arg-type]
+    def _world_model_gradients(
+        self, state: th.Tensor, action: th.Tensor, next_state: th.Tensor, rewards: th.Tensor, weight: th.Tensor | None
+    ) -> tuple[th.Tensor, th.Tensor, Gradients]:
+        transition, reward = world_model_loss(self.world_model, state, action, next_state, rewards, weight, self.sample_masks)
         return transition.detach(), reward.detach(), gradients_of(self.world_model, transition + reward)
 
     def _update_actor(self, transitions, next_actions: th.Tensor, guided: bool) -> dict[str, th.Tensor]:

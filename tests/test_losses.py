@@ -164,6 +164,13 @@ def test_world_model_loss_is_the_mean_likelihood(transitions):
         th.testing.assert_close(loss, terms.mean())
 
 
+def test_masks_are_drawn_anew_for_each_loss_where_they_are_probabilities(transitions):
+    model, *data = transitions
+    model.set_masks(*(th.full_like(mask, 0.5) for mask in (th.ones(3, 3), th.ones(3, 2), th.ones(3), th.ones(2))))
+    plain, drawn = ({sum(world_model_loss(model, *data, sample_masks=one)).item() for _ in range(5)} for one in (False, True))
+    assert len(plain) == 1 and len(drawn) == 5
+
+
 def test_weights_of_zero_leave_transitions_out(transitions):
     model, state, action, next_state, reward = transitions
     weight = th.tensor([1.0, 0.0] * 5)

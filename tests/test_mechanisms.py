@@ -115,6 +115,36 @@ def test_guidance_enters_the_actors_loss(trained, monkeypatch):
     assert denoising() != guided
 
 
+def test_acting_looks_at_the_value_of_an_action_that_is_adapted_to_the_next_state(observations, monkeypatch):
+    policy = CausalGDP("MlpPolicy", "Pendulum-v1", **KWARGS).policy
+    state, action, asked = th.as_tensor(observations), th.linspace(-0.5, 0.5, 16).unsqueeze(1), []
+    original = policy.value_gradient
+    monkeypatch.setattr(policy, "value_gradient", lambda *args: asked.append(args) or original(*args))
+    with th.no_grad():
+        policy.acting_guidance(state, action)
+        ((next_state, next_action, _),) = asked
+        th.testing.assert_close(next_state, policy.world_model.action_response(state, action).next_state)
+        assert th.equal(next_action, policy.actor.adapt(next_state, action))
+        # The denoiser's clean estimate, and so another one in another state
+        schedule, step = policy.actor.schedule, policy.actor.adapting_step
+        spread, signal = schedule.sqrt_one_minus_alpha_bar[step], schedule.sqrt_alpha_bar[step]
+        predicted = policy.actor.denoiser(signal * action, th.full((len(action),), step), next_state)
+        th.testing.assert_close(next_action, (action - spread / signal * predicted).clamp(-1.0, 1.0))
+        assert not th.allclose(policy.actor.adapt(state.flip(0), action), next_action)
+
+
+@pytest.mark.parametrize(
+    ("noise_schedule", "diffusion_steps"), [("vp", 1), ("vp", 5), ("vp", 100), ("linear", 20), ("cosine", 5)]
+)
+def test_actions_are_adapted_where_little_noise_is_left(noise_schedule, diffusion_steps):
+    model = CausalGDP(
+        "MlpPolicy", "Pendulum-v1", noise_schedule=noise_schedule, diffusion_steps=diffusion_steps, buffer_size=1
+    )
+    actor = model.actor
+    noise = [1.0 - alpha_bar for alpha_bar in actor.schedule.alpha_bar_list]
+    assert noise[actor.adapting_step] >= 0.1 and all(share < 0.1 for share in noise[: actor.adapting_step])
+
+
 # Masks ------------------------------------------------------------------------------------------------------------------
 
 
@@ -152,6 +182,18 @@ def test_masks_are_those_of_the_graph_and_steer_the_policy(trained, observations
     unsteered = predict(model, observations)
     world.set_masks(*saved)
     assert np.abs(played - unsteered).max() > 1e-3
+
+
+@pytest.mark.parametrize("sample_masks", [True, False])
+def test_the_world_model_trains_on_masks_that_are_drawn_unless_they_shall_scale(sample_masks):
+    model = learn(60, **({} if sample_masks else {"sample_masks": False}))
+    world = model.world_model
+    names = ("state_to_state", "action_to_state", "state_to_reward", "action_to_reward")
+    world.set_masks(*(th.full_like(getattr(world, name), 0.5) for name in names))
+    data = model.replay_buffer.sample(16)
+    batch = (data.observations, data.actions, data.next_observations, data.rewards.flatten(), None)
+    losses = {model._world_model_gradients(*batch)[0].item() for _ in range(5)}
+    assert len(losses) == (5 if sample_masks else 1)
 
 
 # Refresh ----------------------------------------------------------------------------------------------------------------

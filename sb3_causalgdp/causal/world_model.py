@@ -128,6 +128,11 @@ def through(gradient: th.Tensor, jacobian: th.Tensor) -> th.Tensor:
     return (gradient.unsqueeze(1) @ jacobian).squeeze(1)
 
 
+def _drawn(mask: th.Tensor) -> th.Tensor:
+    # Exact at 0 and 1: a uniform number is below 1 and not below 0
+    return (th.rand_like(mask) < mask).to(mask.dtype)
+
+
 class ActionResponse(NamedTuple):
     """What the world model predicts at an action, and how that moves with the action; all in raw units, without a graph."""
 
@@ -345,15 +350,17 @@ class MaskedWorldModel(nn.Module):
         :param action: Shape ``(batch, d)``
         :param next_state: Shape ``(batch, n)``
         :param reward: Shape ``(batch,)``
-        :param sample_masks: Whether a mask is the probability that its edge is there, and which edges are is drawn anew
+        :param sample_masks: Whether the masks are probabilities, and which edges are there is drawn anew for the whole
+            batch. A weight behind a mask cannot grow to make up for it then, and with the masks themselves in its place, as in
+            every prediction, the model's derivative by a cause is about the probability times what it is through the edge. The
+            residual path keeps the masks
         :return: That of the transition model, per variable, shape ``(batch,)``, and that of the reward model, ``(batch,)``
         """
-        masks = self._transition_mask(), self._reward_mask()
+        transition_mask, reward_mask = self._transition_mask(), self._reward_mask()
         if sample_masks:
-            # Exact at 0 and 1: a uniform number is below 1 and not below 0
-            masks = tuple((th.rand_like(mask) < mask).to(mask.dtype) for mask in masks)
-        next_mean, next_std = self._next_state(state, action, masks[0])
-        reward_mean, reward_std = self._reward(next_state, action, masks[1])
+            transition_mask, reward_mask = _drawn(transition_mask), _drawn(reward_mask)
+        next_mean, next_std = self._next_state(state, action, transition_mask)
+        reward_mean, reward_std = self._reward(next_state, action, reward_mask)
         transition = 0.5 * ((next_state - next_mean) / next_std).square() + self._bounded(self.transition_log_std)
         reward_term = 0.5 * ((reward - reward_mean) / reward_std).square() + self._bounded(self.reward_log_std)
         return transition.mean(dim=1), reward_term
