@@ -49,6 +49,7 @@ CAUSALGDP_METHODS: dict[str, dict[str, Any]] = {
     "direct_lingam": {"causal_discovery": "direct_lingam"},
     "perturbed": {"causal_discovery": "perturbed", "causal_discovery_kwargs": {"method": "partial_r2", "noise": 0.5}},
     "open": {"causal_discovery": all_edges_open},
+    "scaled": {"sample_masks": False},
     "no_guidance": {"guidance": None},
     "layer_norm": {"policy_kwargs": {"net_arch": NET_ARCH, "critic_layer_norm": True}},
     # Cloning a distribution means to play samples of it: not the best of ten, and none of exploration's noise
