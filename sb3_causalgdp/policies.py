@@ -467,13 +467,11 @@ class CausalGDPPolicy(BasePolicy):
         """
         if self.has_image_state:
             return tuple(f"feature[{index}]" for index in range(self._state_dim()))
-        if isinstance(self.observation_space, spaces.Dict):
-            named = self.observation_space.spaces.items()
-        else:
-            named = {"obs": self.observation_space}.items()
+        names = list(self.observation_space.spaces) if isinstance(self.observation_space, spaces.Dict) else ["obs"]
         # The key "action" would give the names of the actions
-        prefixes = ((f"obs[{name}]" if name == "action" else name, space) for name, space in named)
-        return tuple(f"{prefix}[{index}]" for prefix, space in prefixes for index in range(spaces.flatdim(space)))
+        prefixes = [f"obs[{name}]" if name == "action" else name for name in names]
+        sized = zip(prefixes, self.leaf_sizes, strict=True)
+        return tuple(f"{prefix}[{index}]" for prefix, size in sized for index in range(size))
 
     @th.no_grad()
     def causal_state(self, observation: PyTorchObs) -> th.Tensor:
