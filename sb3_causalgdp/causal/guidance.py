@@ -5,7 +5,7 @@ from typing import NamedTuple, Protocol
 
 import torch as th
 
-from sb3_causalgdp.causal.world_model import ActionResponse, MaskedWorldModel, through
+from sb3_causalgdp.causal.world_model import ActionResponse, MaskedWorldModel
 from sb3_causalgdp.checks import check_at_least_zero
 
 
@@ -14,8 +14,10 @@ class OutcomeTerm(NamedTuple):
 
     error: th.Tensor
     """(target - prediction) / std, shape ``(batch,)``."""
-    jacobian: th.Tensor
-    """d prediction / d action / std, shape ``(batch, d)``."""
+    by_next_state: th.Tensor
+    """Partial derivative of the prediction by the next state / std, shape ``(batch, n)``."""
+    by_action: th.Tensor
+    """Partial derivative of the prediction by the action, the next state as it is, / std, shape ``(batch, d)``."""
 
 
 class OutcomeTarget(Protocol):
@@ -24,7 +26,7 @@ class OutcomeTarget(Protocol):
     def __call__(self, response: ActionResponse) -> OutcomeTerm:
         """
         :param response: What the world model predicts at the action
-        :return: The outcome's error and Jacobian
+        :return: The outcome's error and derivatives
         """
         ...  # pragma: no cover
 
@@ -41,7 +43,8 @@ class RewardTarget:
 
     def __call__(self, response: ActionResponse) -> OutcomeTerm:
         error = (self.reward - response.reward) / response.reward_std
-        return OutcomeTerm(error, response.reward_jacobian / response.reward_std)
+        std = response.reward_std
+        return OutcomeTerm(error, response.reward_by_next_state / std, response.reward_by_action / std)
 
 
 class ReturnTarget:
@@ -61,9 +64,8 @@ class ReturnTarget:
         self.std = std
 
     def __call__(self, response: ActionResponse) -> OutcomeTerm:
-        through_value = through(self.value_gradient(response.next_state), response.next_state_jacobian)
-        jacobian = (response.reward_jacobian + self.discount * through_value) / self.std
-        return OutcomeTerm(th.ones_like(response.reward), jacobian)
+        by_next_state = response.reward_by_next_state + self.discount * self.value_gradient(response.next_state)
+        return OutcomeTerm(th.ones_like(response.reward), by_next_state / self.std, response.reward_by_action / self.std)
 
 
 class CausalGuidance:
@@ -112,13 +114,15 @@ class CausalGuidance:
         :return: As for a call with these actions
         """
         outcome = self.outcome(response)
-        gradient = self.outcome_scale * outcome.error.unsqueeze(1) * outcome.jacobian
-        curvature = self.outcome_scale * outcome.jacobian.unsqueeze(2) * outcome.jacobian.unsqueeze(1)
+        by_error = (self.next_state - response.next_state) / response.next_state_std.square()
+        through, to_next_state = response.through_next_state(outcome.by_next_state, by_error).unbind(dim=1)
+        jacobian = outcome.by_action + through
+        gradient = self.outcome_scale * outcome.error.unsqueeze(1) * jacobian
+        curvature = self.outcome_scale * jacobian.unsqueeze(2) * jacobian.unsqueeze(1)
         if self.state_scale > 0.0:
-            error = (self.next_state - response.next_state) / response.next_state_std
-            jacobian = response.next_state_jacobian / response.next_state_std.unsqueeze(1)
-            gradient = gradient + self.state_scale * through(error, jacobian)
-            curvature = curvature + self.state_scale * (jacobian.mT @ jacobian)
+            by_action = response.standardised_jacobian
+            gradient = gradient + self.state_scale * to_next_state
+            curvature = curvature + self.state_scale * (by_action.mT @ by_action)
         return gradient, curvature
 
 

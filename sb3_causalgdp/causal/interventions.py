@@ -389,7 +389,7 @@ class StructuralModel:
             next_state, action = response.next_state.requires_grad_(), action.requires_grad_()
             reward, _ = self.world_model.predict_reward(next_state, action)
             by_state, by_action = th.autograd.grad(reward.sum(), (next_state, action))
-        through_state = th.einsum("bj,bji->bi", by_state, response.next_state_jacobian)
+        through_state = response.through_next_state(by_state)
         per_unit = self.reward_scale / self.action_half_range
         next_state_effect = _array(response.next_state_jacobian) * self.state_scale[:, None] / self.action_half_range
         direct, through = _array(by_action) * per_unit, _array(through_state) * per_unit

@@ -117,37 +117,49 @@ def _through_tanh(gradient: th.Tensor, output: th.Tensor) -> th.Tensor:
     return th.ops.aten.tanh_backward(gradient, output)
 
 
-def through(gradient: th.Tensor, jacobian: th.Tensor) -> th.Tensor:
-    """
-    The chain rule.
-
-    :param gradient: Shape ``(batch, n)``
-    :param jacobian: Shape ``(batch, n, d)``
-    :return: Shape ``(batch, d)``
-    """
-    return (gradient.unsqueeze(1) @ jacobian).squeeze(1)
-
-
 def _drawn(mask: th.Tensor) -> th.Tensor:
     # Exact at 0 and 1: a uniform number is below 1 and not below 0
     return (th.rand_like(mask) < mask).to(mask.dtype)
 
 
 class ActionResponse(NamedTuple):
-    """What the world model predicts at an action, and how that moves with the action; all in raw units, without a graph."""
+    """What the world model predicts at an action, and how that moves with the action, in raw units and without a graph."""
 
     next_state: th.Tensor
     """Mean of the next state, shape ``(batch, n)``."""
     next_state_std: th.Tensor
     """Standard deviation of the next state, shape ``(n,)``."""
-    next_state_jacobian: th.Tensor
-    """d next state / d action, shape ``(batch, n, d)``."""
+    standardised_jacobian: th.Tensor
+    """d next state / d action in these standard deviations, shape ``(batch, n, d)``."""
     reward: th.Tensor
     """Mean of the reward at the predicted next state, shape ``(batch,)``."""
     reward_std: th.Tensor
     """Standard deviation of the reward, shape ``()``."""
-    reward_jacobian: th.Tensor
-    """d reward / d action, the path through the next state included, shape ``(batch, d)``."""
+    reward_by_next_state: th.Tensor
+    """Partial derivative of the reward by the next state, shape ``(batch, n)``."""
+    reward_by_action: th.Tensor
+    """Partial derivative of the reward by the action, shape ``(batch, d)``."""
+
+    @property
+    def next_state_jacobian(self) -> th.Tensor:
+        """d next state / d action, shape ``(batch, n, d)``."""
+        return self.next_state_std.unsqueeze(1) * self.standardised_jacobian
+
+    @property
+    def reward_jacobian(self) -> th.Tensor:
+        """d reward / d action, the path through the next state included, shape ``(batch, d)``."""
+        return self.reward_by_action + self.through_next_state(self.reward_by_next_state)
+
+    def through_next_state(self, *gradients: th.Tensor) -> th.Tensor:
+        """
+        The chain rule, for several gradients in one pass over the Jacobian.
+
+        :param gradients: Of something by the next state, each of shape ``(batch, n)``
+        :return: Of the same by the action, shape ``(batch, d)``; of several, shape ``(batch, q, d)``
+        """
+        rows = th.stack(gradients, dim=1) * self.next_state_std
+        products = rows @ self.standardised_jacobian
+        return products if len(gradients) > 1 else products.squeeze(1)
 
 
 class MaskedWorldModel(nn.Module):
@@ -377,9 +389,11 @@ class MaskedWorldModel(nn.Module):
         standardised, inputs = self._network_input(state, action)
         residual_std, state_std = self.residual_std, self.state_std
         actions = slice(self.state_dim, None)
-        # Humanoid's Jacobians fill megabytes: no pass over them that is not needed
-        scale = (residual_std * state_std).unsqueeze(1)
-        change, jacobian = self.transition.forward_and_jacobian(inputs, self._transition_mask(), actions, scale)
+        noise_std = self._bounded(self.transition_log_std).exp()
+        # In standard deviations from the start: Humanoid's Jacobians fill megabytes, and each pass over them takes time
+        change, jacobian = self.transition.forward_and_jacobian(
+            inputs, self._transition_mask(), actions, (1.0 / noise_std).unsqueeze(1)
+        )
         next_standardised = self.state_to_state.diagonal() * standardised + residual_std * change
         reward_inputs = th.cat([next_standardised.clamp(-self.INPUT_BOUND, self.INPUT_BOUND), action], dim=1)
         reward, reward_gradient = self.reward.forward_and_jacobian(
@@ -390,9 +404,10 @@ class MaskedWorldModel(nn.Module):
         by_next_state = by_next_state * (next_standardised.abs() <= self.INPUT_BOUND) / state_std
         return ActionResponse(
             next_state=self.state_mean + state_std * next_standardised,
-            next_state_std=self._bounded(self.transition_log_std).exp() * residual_std * state_std,
-            next_state_jacobian=jacobian,
+            next_state_std=noise_std * residual_std * state_std,
+            standardised_jacobian=jacobian,
             reward=self.reward_mean + self.reward_scale * reward.squeeze(1),
             reward_std=self._bounded(self.reward_log_std).exp() * self.reward_scale,
-            reward_jacobian=by_action + through(by_next_state, jacobian),
+            reward_by_next_state=by_next_state,
+            reward_by_action=by_action,
         )

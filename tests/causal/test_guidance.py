@@ -29,13 +29,15 @@ class LinearWorld(MaskedWorldModel):
         self.reward_by_action = th.randn(D, generator=generator)
 
     def action_response(self, state, action):
+        std = th.tensor([0.5, 1.0, 2.0, 0.7])
         return ActionResponse(
             next_state=0.5 * state + action @ self.by_action.T,
-            next_state_std=th.tensor([0.5, 1.0, 2.0, 0.7]),
-            next_state_jacobian=self.by_action.expand(len(action), N, D),
+            next_state_std=std,
+            standardised_jacobian=(self.by_action / std.unsqueeze(1)).expand(len(action), N, D),
             reward=action @ self.reward_by_action,
             reward_std=th.tensor(0.8),
-            reward_jacobian=self.reward_by_action.expand(len(action), D),
+            reward_by_next_state=th.zeros(len(action), N),
+            reward_by_action=self.reward_by_action.expand(len(action), D),
         )
 
 
