@@ -139,11 +139,6 @@ def _normalises(module: nn.Module, layer: nn.Linear) -> bool:
     return module.weight is not None and module.bias is not None
 
 
-def _through(gradient: np.ndarray, jacobian: np.ndarray) -> np.ndarray:
-    """Gradient by the next state, shape ``(batch, n)``, times its Jacobian, ``(n, batch, d)``: shape ``(batch, d)``."""
-    return (gradient[:, None] @ jacobian.transpose(1, 0, 2))[:, 0]
-
-
 class _ReverseStep:
     """The coefficients of a diffusion step."""
 
@@ -353,7 +348,7 @@ class _Blocks:
 
 
 class _WorldModel:
-    """:meth:`~sb3_causalgdp.causal.MaskedWorldModel.action_response`, with Jacobians of shape ``(n, batch, d)``."""
+    """:meth:`~sb3_causalgdp.causal.MaskedWorldModel.action_response`."""
 
     def __init__(self, model: MaskedWorldModel) -> None:
         self.model = model
@@ -379,19 +374,20 @@ class _WorldModel:
         mask = np.concatenate([arrays["state_to_state"], arrays["action_to_state"]], axis=1)
         change, jacobian = self.transition.forward_and_jacobian(inputs, mask, n_states)
         next_standardised = gate * standardised + residual_std * change
-        next_jacobian = residual_std[:, None, None] * jacobian
+        noise_std = np.exp(arrays["transition_log_std"].clip(*self.log_std_bounds))
         reward_inputs = np.concatenate([next_standardised.clip(*self.input_bounds), action], axis=1)
         reward_mask = np.concatenate([arrays["state_to_reward"], arrays["action_to_reward"]])[None]
         reward, reward_gradient = self.reward.forward_and_jacobian(reward_inputs, reward_mask, 0)
-        by_next_state = reward_gradient[0, :, :n_states] * (np.abs(next_standardised) <= self.input_bounds[1])
-        total = reward_gradient[0, :, n_states:] + _through(by_next_state, next_jacobian)
+        reward_gradient = reward_scale * reward_gradient[0]
+        within = np.abs(next_standardised) <= self.input_bounds[1]
         return {
             "next_state": arrays["state_mean"] + state_std * next_standardised,
-            "next_state_std": np.exp(arrays["transition_log_std"].clip(*self.log_std_bounds)) * residual_std * state_std,
-            "next_state_jacobian": state_std[:, None, None] * next_jacobian,
+            "next_state_std": noise_std * residual_std * state_std,
+            "standardised_jacobian": (jacobian / noise_std[:, None, None]).transpose(1, 0, 2),
             "reward": arrays["reward_mean"] + reward_scale * reward[:, 0],
             "reward_std": np.exp(arrays["reward_log_std"].clip(*self.log_std_bounds)) * reward_scale,
-            "reward_jacobian": reward_scale * total,
+            "reward_by_next_state": reward_gradient[:, :n_states] * within / state_std,
+            "reward_by_action": reward_gradient[:, n_states:],
         }
 
 
@@ -533,26 +529,22 @@ class NumpyActing:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Gradient and curvature of the guidance at the best candidate, whose predicted state is the one to reach."""
         response = self.world_model.response(state, action)
+        by_next_state, by_action = response["reward_by_next_state"], response["reward_by_action"]
         if policy.guidance_target == "return":
-            error = np.ones(len(state), dtype=state.dtype)
-            through_value = self._value_jacobian(policy, response, action, time_part)
-            jacobian = response["reward_jacobian"] + policy.discount * through_value
-            jacobian = jacobian / _view(policy.return_std)
+            error, std = _ONE, _view(policy.return_std)
+            by_next_state = by_next_state + np.float32(policy.discount) * self._value_gradient(response, action, time_part)
         else:
-            error = (_view(policy.reward_target) - response["reward"]) / response["reward_std"]
-            jacobian = response["reward_jacobian"] / response["reward_std"]
+            std = response["reward_std"]
+            error = ((_view(policy.reward_target) - response["reward"]) / std)[:, None]
+        to_state = response["standardised_jacobian"]
+        jacobian = (by_action + ((by_next_state * response["next_state_std"])[:, None] @ to_state)[:, 0]) / std
         scale = np.float32(policy.outcome_guidance_scale)
-        gradient = scale * error[:, None] * jacobian
+        gradient = scale * error * jacobian
         curvature = scale * jacobian[:, :, None] * jacobian[:, None, :]
         if policy.state_guidance_scale > 0.0:
-            by_state = (response["next_state_jacobian"] / response["next_state_std"][:, None, None]).transpose(1, 0, 2)
-            curvature = curvature + np.float32(policy.state_guidance_scale) * (by_state.transpose(0, 2, 1) @ by_state)
+            curvature = curvature + np.float32(policy.state_guidance_scale) * (to_state.transpose(0, 2, 1) @ to_state)
         return gradient, curvature
 
-    def _value_jacobian(
-        self, policy: Policy, response: dict[str, np.ndarray], action: np.ndarray, time_part: np.ndarray
-    ) -> np.ndarray:
+    def _value_gradient(self, response: dict[str, np.ndarray], action: np.ndarray, time_part: np.ndarray) -> np.ndarray:
         next_state = response["next_state"].T
-        next_action = self.denoiser.adapt(next_state, action.T, time_part)
-        by_state = self.critics.gradient(next_state, next_action)
-        return _through(by_state.T, response["next_state_jacobian"])
+        return self.critics.gradient(next_state, self.denoiser.adapt(next_state, action.T, time_part)).T

@@ -15,7 +15,7 @@ import torch as th
 
 from benchmarks.offline.data import ensure_dataset, transitions
 from sb3_causalgdp.causal import MaskedWorldModel, TransitionVariables
-from sb3_causalgdp.causal.discovery import make_discovery
+from sb3_causalgdp.causal.discovery.partial_r2 import PartialR2
 from sb3_causalgdp.losses import world_model_loss
 
 TASK = "maze2d-umaze"
@@ -111,7 +111,7 @@ def errors(arrays: Transitions, count: int, updates: int, masks: str, seed: int 
 def _discovered(arrays: Transitions) -> list[th.Tensor]:
     n, d = arrays["observations"].shape[1], arrays["actions"].shape[1]
     variables = TransitionVariables(tuple(f"s[{i}]" for i in range(n)), tuple(f"a[{i}]" for i in range(d)))
-    discovery = make_discovery("partial_r2")
+    discovery = PartialR2()
     statistics = discovery.make_statistics(variables)
     statistics.update(np.column_stack([values.double().numpy() for values in arrays.values()]))
     graph = discovery(statistics, variables)
