@@ -42,14 +42,18 @@ def all_edges_open(statistics: Any, variables: TransitionVariables, previous: Ca
     return CausalGraph.fully_connected(variables)
 
 
+PERTURBED = {"causal_discovery": "perturbed", "causal_discovery_kwargs": {"method": "partial_r2", "noise": 0.5}}
 # Arguments of CausalGDP beside those that all of them have
 CAUSALGDP_METHODS: dict[str, dict[str, Any]] = {
     "causalgdp": {},
     "notears": {"causal_discovery": "notears"},
     "direct_lingam": {"causal_discovery": "direct_lingam"},
-    "perturbed": {"causal_discovery": "perturbed", "causal_discovery_kwargs": {"method": "partial_r2", "noise": 0.5}},
+    "perturbed": PERTURBED,
     "open": {"causal_discovery": all_edges_open},
+    # With masks that scale the world model's inputs
     "scaled": {"sample_masks": False},
+    "notears_scaled": {"causal_discovery": "notears", "sample_masks": False},
+    "perturbed_scaled": {**PERTURBED, "sample_masks": False},
     "no_guidance": {"guidance": None},
     "layer_norm": {"policy_kwargs": {"net_arch": NET_ARCH, "critic_layer_norm": True}},
     # Cloning a distribution means to play samples of it: not the best of ten, and none of exploration's noise
