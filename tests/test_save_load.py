@@ -230,6 +230,7 @@ ARGUMENTS = {
     "outcome_guidance_scale": 0.6,
     "causal_discovery_kwargs": {"threshold": 0.05},
     "causal_window": 5_000,
+    "sample_masks": False,
     "offline_dataset": "D4RL/pointmaze/umaze-v2",
     "pretrain_steps": 9,
     "offline_fraction": 0.25,
