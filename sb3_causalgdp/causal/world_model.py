@@ -12,8 +12,8 @@ class MaskedBlocks(nn.Module):
     One small multi-layer perceptron per output, evaluated for all outputs at once.
 
     Output j computes ``f_j(mask[j] * x)``. Masking the input of block j is masking its columns of the first layer, so all
-    layers are batched products of small matrices. Blocks share nothing: the derivative of output j by an input whose mask is 0 is exactly 0, and one backward pass gives the Jacobian of
-    all outputs.
+    layers are batched products of small matrices. Blocks share nothing: the derivative of output j by an input whose mask is
+    0 is exactly 0, and one backward pass gives the Jacobian of all outputs.
 
     :param n_inputs: Number of inputs p
     :param n_outputs: Number of outputs m
