@@ -14,8 +14,7 @@ import numpy as np
 import torch as th
 
 from benchmarks.offline.data import ensure_dataset, transitions
-from sb3_causalgdp.causal import MaskedWorldModel, TransitionVariables
-from sb3_causalgdp.causal.discovery.partial_r2 import PartialR2
+from sb3_causalgdp.causal import MaskedWorldModel, TransitionVariables, discover
 from sb3_causalgdp.losses import world_model_loss
 
 TASK = "maze2d-umaze"
@@ -111,10 +110,7 @@ def errors(arrays: Transitions, count: int, updates: int, masks: str, seed: int 
 def _discovered(arrays: Transitions) -> list[th.Tensor]:
     n, d = arrays["observations"].shape[1], arrays["actions"].shape[1]
     variables = TransitionVariables(tuple(f"s[{i}]" for i in range(n)), tuple(f"a[{i}]" for i in range(d)))
-    discovery = PartialR2()
-    statistics = discovery.make_statistics(variables)
-    statistics.update(np.column_stack([values.double().numpy() for values in arrays.values()]))
-    graph = discovery(statistics, variables)
+    graph = discover("partial_r2", variables.stack(*(values.numpy() for values in arrays.values())), variables)
     masks = (graph.state_to_state, graph.action_to_state, graph.state_to_reward, graph.action_to_reward)
     return [th.as_tensor(mask, dtype=th.float32) for mask in masks]
 

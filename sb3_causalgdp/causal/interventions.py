@@ -385,14 +385,10 @@ class StructuralModel:
         """Of the reward: total, direct and through s', each of shape ``(batch, d)``; of the next state ``(batch, n, d)``."""
         action = self._model_action(actions)
         response = self.world_model.action_response(self._model_state(self._tensor(states)), action)
-        with th.enable_grad():
-            next_state, action = response.next_state.requires_grad_(), action.requires_grad_()
-            reward, _ = self.world_model.predict_reward(next_state, action)
-            by_state, by_action = th.autograd.grad(reward.sum(), (next_state, action))
-        through_state = response.through_next_state(by_state)
+        through_state = response.through_next_state(response.reward_by_next_state)
         per_unit = self.reward_scale / self.action_half_range
         next_state_effect = _array(response.next_state_jacobian) * self.state_scale[:, None] / self.action_half_range
-        direct, through = _array(by_action) * per_unit, _array(through_state) * per_unit
+        direct, through = _array(response.reward_by_action) * per_unit, _array(through_state) * per_unit
         return direct + through, direct, through, next_state_effect
 
     def _difference_quotients(self, states: np.ndarray, actions: np.ndarray, delta: np.ndarray) -> tuple[np.ndarray, ...]:
