@@ -33,6 +33,7 @@ from sb3_causalgdp.causal.graph import replaced_when_done
 from sb3_causalgdp.causal.interventions import ActionRule
 from sb3_causalgdp.causal.world_model import MaskedWorldModel
 from sb3_causalgdp.checks import check_at_least_zero, is_count
+from sb3_causalgdp.device_replay import DeviceReplay
 from sb3_causalgdp.gradients import Gradients, check_compile, compiled, gradients_of
 from sb3_causalgdp.losses import critic_loss, denoising_loss, q_loss, td_target, world_model_loss
 from sb3_causalgdp.offline.algorithm import OfflineToOnlineAlgorithm, callback_list
@@ -289,6 +290,7 @@ class CausalGDP(OfflineToOnlineAlgorithm):
         # The same of the preloaded transitions, and which these were
         self._fed_offline_position = 0
         self._fed_marks: list[str] = []
+        self._device_replays: dict[str, tuple[ReplayBuffer, DeviceReplay | None]] = {}
 
         check_compile(self.compile, self.device)
         if _init_setup_model:
@@ -558,7 +560,21 @@ class CausalGDP(OfflineToOnlineAlgorithm):
         return concatenate_samples([draw(buffer, count) for buffer, count in parts if buffer is not None and count > 0])
 
     def _draw(self, replay_buffer: ReplayBuffer, batch_size: int) -> Any:
+        if self._vec_normalize_env is None:
+            on_device = self._device_replay(replay_buffer)
+            if on_device is not None:
+                return on_device.sample(batch_size)
         return replay_buffer.sample(batch_size, env=self._vec_normalize_env)
+
+    def _device_replay(self, replay_buffer: ReplayBuffer) -> DeviceReplay | None:
+        """The copy on the device of one of the two buffers; made anew when it was replaced."""
+        name = "offline" if replay_buffer is self.offline_buffer else "online"
+        known = self._device_replays.get(name)
+        if known is None or known[0] is not replay_buffer:
+            covered = DeviceReplay.covers(replay_buffer, self.device)
+            known = (replay_buffer, DeviceReplay(replay_buffer, self.device) if covered else None)
+            self._device_replays[name] = known
+        return known[1]
 
     def _draw_one_step(self, replay_buffer: ReplayBuffer, batch_size: int) -> Any:
         # The n-step buffer gives n-step rewards and observations, which are wrong for a one-step world model
@@ -701,6 +717,8 @@ class CausalGDP(OfflineToOnlineAlgorithm):
         first = 0 if self.offline_buffer is None else self.offline_buffer.size()
         super().preload(source, *args, **kwargs)
         assert self.offline_buffer is not None
+        # Rows that are there already may have other rewards now
+        self._device_replays.pop("offline", None)
         if self._offline_marks[-1] in self._fed_marks and self._fed_offline_position == first:
             # A loaded model, whose statistics know these rows
             self._fed_offline_position = self.offline_buffer.size()
@@ -766,6 +784,7 @@ class CausalGDP(OfflineToOnlineAlgorithm):
             *COMPILED,
             "discovery",
             "_fed_offline_position",
+            "_device_replays",
             "causal_graph_history",
             "actor_batch_norm_stats",
             "critic_batch_norm_stats",

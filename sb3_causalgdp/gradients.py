@@ -7,6 +7,8 @@ from typing import Any
 
 import torch as th
 
+from sb3_causalgdp.products import uses_onednn
+
 Gradients = tuple[th.Tensor | None, ...]
 """One gradient for each parameter of a module, None where a parameter has no part in the loss or is not trained."""
 
@@ -36,9 +38,14 @@ def compiled(function: Callable[..., Any], mode: bool | str, device: th.device) 
 
     @cache
     def graph() -> Callable[..., Any]:
-        options = th._inductor.list_mode_options(mode) if isinstance(mode, str) else {}
+        options: dict[str, Any] = th._inductor.list_mode_options(mode) if isinstance(mode, str) else {}
         # On a CPU the calls between the kernels are compiled, too: a twentieth of an update
         options |= {"fallback_random": True, "cpp_wrapper": device.type == "cpu"}
+        if device.type == "cpu" and uses_onednn():
+            # Two seconds, as in check_compile
+            from sb3_causalgdp.product_pass import OneDnnProducts
+
+            options |= {"post_grad_custom_post_pass": OneDnnProducts()}
         return th.compile(  # type: ignore[call-overload]  # the type stubs lack two arguments
             function, options=options, isolate_recompiles=True, recompile_limit=_MOST_GRAPHS
         )

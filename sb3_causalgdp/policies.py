@@ -25,6 +25,7 @@ from sb3_causalgdp.checks import check_at_least_zero
 from sb3_causalgdp.diffusion import Guidance, GuidanceRule, MLPDenoiser, NoiseSchedule, sample
 from sb3_causalgdp.diffusion.activations import fast
 from sb3_causalgdp.diffusion.samplers import bind, check_sampler
+from sb3_causalgdp.products import make_layers_fast
 
 ACTIVATIONS: dict[str, type[nn.Module]] = {
     "mish": nn.Mish,
@@ -78,13 +79,14 @@ class Critic(ContinuousCritic):
 
     def __init__(self, layer_norm: bool = False, **kwargs: Any) -> None:
         super().__init__(**kwargs)
-        if not layer_norm:
-            return
         n_inputs = kwargs["features_dim"] + get_action_dim(kwargs["action_space"])
-        for index in range(self.n_critics):
-            layers = create_mlp(n_inputs, 1, kwargs["net_arch"], kwargs["activation_fn"], post_linear_modules=[nn.LayerNorm])
-            self.q_networks[index] = nn.Sequential(*layers)
-            setattr(self, f"qf{index}", self.q_networks[index])
+        for index, network in enumerate(self.q_networks):
+            if layer_norm:
+                norms: list[type[nn.Module]] = [nn.LayerNorm]
+                layers = create_mlp(n_inputs, 1, kwargs["net_arch"], kwargs["activation_fn"], post_linear_modules=norms)
+                self.q_networks[index] = network = nn.Sequential(*layers)
+                setattr(self, f"qf{index}", network)
+            make_layers_fast(network)
 
 
 class DiffusionActor(BasePolicy):

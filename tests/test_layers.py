@@ -13,13 +13,14 @@ LAYERS = [
     {"__init__"},
     {"causalgdp"},
     {"callbacks"},
-    {"losses", "gradients", "diagnostics", "structural"},
+    {"losses", "gradients", "diagnostics", "structural", "device_replay"},
+    {"product_pass"},
     {"policies"},
     {"acting"},
     {"causal", "offline", "diffusion"},
-    {"checks"},
+    {"checks", "products"},
 ]
-WITHOUT_SB3 = {"causal", "diffusion", "losses", "gradients"}
+WITHOUT_SB3 = {"causal", "diffusion", "losses", "gradients", "products", "product_pass"}
 LEVELS = {part: level for level, parts in enumerate(LAYERS) for part in parts}
 FILES = sorted(PACKAGE.rglob("*.py"))
 

@@ -6,6 +6,8 @@ from typing import NamedTuple
 import torch as th
 from torch import nn
 
+from sb3_causalgdp.products import linear
+
 
 class MaskedBlocks(nn.Module):
     """
@@ -94,7 +96,7 @@ class ManyMaskedBlocks(MaskedBlocks):
     """
 
     def _hidden_layers(self, inputs: th.Tensor, weight: th.Tensor) -> list[th.Tensor]:
-        first = th.addmm(self.input_layer.bias.unsqueeze(1), weight.flatten(0, 1), inputs.t())
+        first = linear(weight.flatten(0, 1), inputs) + self.input_layer.bias.unsqueeze(1)
         layers = [first.view(self.n_outputs, self.width, -1).tanh_()]
         for hidden_weight, bias in zip(self.hidden_weights, self.hidden_biases, strict=True):
             layers.append(th.baddbmm(bias.mT, hidden_weight.mT, layers[-1]).tanh_())

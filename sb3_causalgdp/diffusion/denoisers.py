@@ -5,10 +5,10 @@ from collections.abc import Callable
 from itertools import pairwise
 
 import torch as th
-import torch.nn.functional as F
 from torch import nn
 
 from sb3_causalgdp.diffusion.activations import fast
+from sb3_causalgdp.products import Linear, linear
 
 
 def sinusoidal_embedding(n_steps: int, dimension: int) -> th.Tensor:
@@ -62,7 +62,7 @@ class MLPDenoiser(nn.Module):
         self.input_layer = nn.Linear(action_dim + time_embedding_dim + condition_dim, first)
         layers: list[nn.Module] = []
         for inputs, outputs in pairwise([first, *rest]):
-            layers += [fast(activation_fn)(), nn.Linear(inputs, outputs)]
+            layers += [fast(activation_fn)(), Linear(inputs, outputs)]
         self.network = nn.Sequential(*layers)
 
     def bind(self, condition: th.Tensor) -> Callable[[th.Tensor, int | th.Tensor], th.Tensor]:
@@ -76,8 +76,8 @@ class MLPDenoiser(nn.Module):
         action_weight, time_weight, condition_weight = self.input_layer.weight.split(
             [self.action_dim, time_dim, condition.shape[1]], dim=1
         )
-        from_condition = F.linear(condition, condition_weight, self.input_layer.bias)
-        from_time = F.linear(self.time_mlp(self.time_table), time_weight)
+        from_condition = linear(condition, condition_weight, self.input_layer.bias)
+        from_time = linear(self.time_mlp(self.time_table), time_weight)
 
         def predict_noise(noisy_action: th.Tensor, step: int | th.Tensor) -> th.Tensor:
             return self.network(th.addmm(from_condition + from_time[step], noisy_action, action_weight.t()))
