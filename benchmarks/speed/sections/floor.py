@@ -19,9 +19,10 @@ COLUMNS = (
     "ms of an update",
     "share of the floor",
     "share of its products alone",
+    "share of the floor by PyTorch's own choice",
     "status",
 )
-RATE_COLUMNS = ("layer", "forward", "by_input", "by_weight", "all three")
+RATE_COLUMNS = ("layer", "forward", "by_input", "by_weight", "all three", "all three, PyTorch's own choice")
 # Batch, inputs, outputs of dense layers: hidden; first of denoiser and critics (HalfCheetah, Humanoid); ten candidates; last
 LAYERS = [(256, 256, 256), (256, 39, 256), (256, 23, 256), (256, 381, 256), (2560, 256, 256), (10, 256, 256), (256, 256, 6)]
 REFERENCE = (256, 256, 256)
@@ -41,7 +42,9 @@ def run(benchmark: Benchmark) -> None:
         if worker.contestant.name in plain_of:
             return {"update": update}
         products = worker.ask("products")["value"]
-        return {"update": update, "alone": products["seconds"], "products": products["n_products"], "rate": _rate(worker)}
+        rates = _rates(worker)
+        own = {"alone": products["seconds"], "products": products["n_products"]}
+        return {"update": update, **own, "rate": rates["layer"], "default rate": rates["default"]}
 
     with benchmark.field(who, transitions=benchmark.transitions(HALF_CHEETAH)) as field:
         turns = field.interleaved(benchmark.rounds, turn)
@@ -54,7 +57,9 @@ def run(benchmark: Benchmark) -> None:
                 row |= {"status": "ok", **_row(field.workers[counted].ask("flops")["value"], both)}
             results.rows.append(row | field.absent.get(one.name, {}))
         by_layer = next(iter(field.workers.values())).ask("layer_rates", shapes=LAYERS)["value"]
-    rates: list[Row] = [{**one, "layer": name, "all three": one["layer"]} for name, one in by_layer.items()]
+    rates: list[Row] = [
+        {**one, "layer": name, "all three": one["layer"], RATE_COLUMNS[-1]: one["default"]} for name, one in by_layer.items()
+    ]
     results.about = {"GFLOP/s of dense layers, batch x inputs x outputs": rates}
     shares = {row["contestant"]: row.get("share of the floor") for row in results.rows}
     results.verdicts = [
@@ -68,15 +73,14 @@ def run(benchmark: Benchmark) -> None:
     print("GFLOP/s of dense layers, batch x inputs x outputs\n" + markdown(rates, RATE_COLUMNS), flush=True)
 
 
-def _rate(worker: Worker) -> float:
+def _rates(worker: Worker) -> dict[str, float]:
     """GFLOP/s of a hidden layer, forward and backward."""
-    rates = worker.ask("layer_rates", shapes=[REFERENCE])["value"]
-    return next(iter(rates.values()))["layer"]
+    return next(iter(worker.ask("layer_rates", shapes=[REFERENCE])["value"].values()))
 
 
 def _row(flops: dict[str, float], turns: list[dict[str, float]]) -> dict[str, Any]:
     columns = {name: [turn[name] for turn in turns] for name in turns[0]}
-    floors = [flops["total"] / 1e9 / rate for rate in columns["rate"]]
+    floors, defaults = ([flops["total"] / 1e9 / rate for rate in columns[name]] for name in ("rate", "default rate"))
     return {
         "MFLOP": flops["total"] / 1e6,
         "flops": flops,
@@ -86,4 +90,5 @@ def _row(flops: dict[str, float], turns: list[dict[str, float]]) -> dict[str, An
         "ms of an update": 1e3 * float(np.median(columns["update"])),
         "share of the floor": median_ratio(floors, columns["update"]),
         "share of its products alone": median_ratio(columns["alone"], columns["update"]),
+        "share of the floor by PyTorch's own choice": median_ratio(defaults, columns["update"]),
     }

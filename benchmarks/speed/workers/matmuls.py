@@ -43,7 +43,7 @@ def count_flops(update: Callable[[], Any]) -> dict[str, int]:
 
 def products_alone(update: Callable[[], Any], seconds: float = 0.002) -> dict[str, float]:
     """
-    The matrix products of one update, each layout timed alone, nothing else around it.
+    The matrix products of one update, each layout timed alone by the faster library, nothing else around it.
 
     :param update: Makes one update
     :param seconds: CPU seconds for which each layout is repeated
@@ -55,7 +55,7 @@ def products_alone(update: Callable[[], Any], seconds: float = 0.002) -> dict[st
     for (name, layouts), count in recorder.counts.items():
         operands = [_random(*layout) for layout in layouts]
         total["n_products"] += count
-        total["seconds"] += count * _mean_seconds(getattr(th, name), operands, seconds)
+        total["seconds"] += count * _fastest_seconds(name, operands, seconds)
         left, right = layouts[-2][0], layouts[-1][0]
         total["flops"] += count * 2 * float(th.tensor(left).prod()) * right[-1]
     return total
@@ -69,23 +69,36 @@ def _random(shape: tuple[int, ...], stride: tuple[int, ...]) -> th.Tensor:
 
 def layer_rate(batch: int, inputs: int, outputs: int, seconds: float = 0.1) -> dict[str, float]:
     """
-    The rate of one dense layer's three products.
+    The rate of one dense layer's three products, each by the faster of PyTorch's two libraries for a CPU.
 
     :param batch: Rows
     :param inputs: Input units
     :param outputs: Output units
     :param seconds: CPU seconds for each product
-    :return: GFLOP/s ``forward`` (x W^T), ``by_input`` (g W), ``by_weight`` (g^T x), and of the three together, ``layer``
+    :return: GFLOP/s ``forward`` (x W^T), ``by_input`` (g W), ``by_weight`` (g^T x), of the three together, ``layer``, and of
+        these as PyTorch multiplies by itself, ``default``
     """
     x, weight, gradient = th.randn(batch, inputs), th.randn(outputs, inputs), th.randn(batch, outputs)
     operands = {"forward": (x, weight.t()), "by_input": (gradient, weight), "by_weight": (gradient.t(), x)}
     flops = 2.0 * batch * inputs * outputs
-    taken = {name: _mean_seconds(th.mm, pair, seconds) for name, pair in operands.items()}
+    taken = {name: _fastest_seconds("mm", pair, seconds) for name, pair in operands.items()}
+    default = sum(_mean_seconds(th.mm, pair, seconds) for pair in operands.values())
     rates = {name: flops / one / 1e9 for name, one in taken.items()}
-    return {**rates, "layer": 3.0 * flops / sum(taken.values()) / 1e9}
+    return {**rates, "layer": 3.0 * flops / sum(taken.values()) / 1e9, "default": 3.0 * flops / default / 1e9}
 
 
-def _mean_seconds(product: Callable[..., th.Tensor], operands: Sequence[th.Tensor], seconds: float) -> float:
+def _fastest_seconds(name: str, operands: Sequence[th.Tensor], seconds: float) -> float:
+    """By PyTorch's own choice, or by oneDNN, where a layer can be asked of it."""
+    taken = _mean_seconds(getattr(th, name), operands, seconds)
+    *bias, left, right = operands
+    if name not in ("mm", "addmm") or any(one.ndim != 1 for one in bias) or not hasattr(th.ops.mkldnn, "_linear_pointwise"):
+        return taken
+    layer = th.ops.mkldnn._linear_pointwise.default
+    arguments: tuple[Any, ...] = (left, right.t(), bias[0] if bias else None, "none", [], "")
+    return min(taken, _mean_seconds(layer, arguments, seconds))
+
+
+def _mean_seconds(product: Callable[..., th.Tensor], operands: Sequence[Any], seconds: float) -> float:
     product(*operands)
     calls, start = 0, time.process_time()
     while time.process_time() < start + seconds:
