@@ -73,8 +73,14 @@ ACTIVATIONS: dict[type[nn.Module], Activation] = {
 }
 
 
+def _clip(values: np.ndarray, bounds: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+    # Half of the time of ndarray.clip
+    raised = np.maximum(values, bounds[0])
+    return np.minimum(raised, bounds[1], out=raised)
+
+
 def _clip_action(values: np.ndarray) -> np.ndarray:
-    return values.clip(_MINUS_ONE, _ONE)
+    return _clip(values, (_MINUS_ONE, _ONE))
 
 
 Layer = tuple[np.ndarray, np.ndarray]
@@ -204,10 +210,10 @@ class _Denoiser:
         return time_part + self.condition_weight @ features
 
     def predict_noise(self, noisy_action: np.ndarray, from_rest: np.ndarray) -> np.ndarray:
-        hidden = self.action_weight @ noisy_action
+        hidden, activation = self.action_weight @ noisy_action, self.activation
         hidden += from_rest
         for weight, bias in self.layers:
-            hidden = weight.dot(self.activation(hidden))
+            hidden = weight.dot(activation(hidden))
             hidden += bias
         return hidden
 
@@ -370,12 +376,12 @@ class _WorldModel:
         change = np.minimum(arrays["change_variance"] / (state_std * state_std), _MOST_CHANGE)
         residual_std = np.maximum(np.sqrt(closed * closed + gate * change), _SMALLEST_STD)
         standardised = (state - arrays["state_mean"]) / state_std
-        inputs = np.concatenate([standardised.clip(*self.input_bounds), action], axis=1)
+        inputs = np.concatenate([_clip(standardised, self.input_bounds), action], axis=1)
         mask = np.concatenate([arrays["state_to_state"], arrays["action_to_state"]], axis=1)
         change, jacobian = self.transition.forward_and_jacobian(inputs, mask, n_states)
         next_standardised = gate * standardised + residual_std * change
-        noise_std = np.exp(arrays["transition_log_std"].clip(*self.log_std_bounds))
-        reward_inputs = np.concatenate([next_standardised.clip(*self.input_bounds), action], axis=1)
+        noise_std = np.exp(_clip(arrays["transition_log_std"], self.log_std_bounds))
+        reward_inputs = np.concatenate([_clip(next_standardised, self.input_bounds), action], axis=1)
         reward_mask = np.concatenate([arrays["state_to_reward"], arrays["action_to_reward"]])[None]
         reward, reward_gradient = self.reward.forward_and_jacobian(reward_inputs, reward_mask, 0)
         reward_gradient = reward_scale * reward_gradient[0]

@@ -524,7 +524,7 @@ class CausalGDPPolicy(BasePolicy):
     @property
     def is_guided(self) -> bool:
         """Whether samples are steered: the guidance is on and the causal graph has been found."""
-        return self.guidance_rule is not None and max(self.guidance_rule.scales) > 0.0 and bool(self.guidance_ready > 0.0)
+        return self.guidance_rule is not None and max(self.guidance_rule.scales) > 0.0 and bool(self.guidance_ready)
 
     def make_guidance(
         self, state: th.Tensor, next_state: th.Tensor, next_action: th.Tensor, critic: int | None = None
