@@ -150,27 +150,26 @@ class _ReverseStep:
 
     def __init__(self, schedule: NoiseSchedule, step: int, eta: float) -> None:
         alpha_bar = schedule.alpha_bar_list[step]
-        # a0_hat = clean_by_noisy a^k - clean_by_noise eps, and a guidance takes its shift off eps
+        # a0_hat = clean_by_noisy a^k - clean_by_noise eps
         self.clean_by_noisy = _constant(alpha_bar**-0.5)
         self.clean_by_noise = _constant((1.0 / alpha_bar - 1.0) ** 0.5)
         self.signal = _constant(alpha_bar**0.5)
-        *self.by, std = map(_constant, transition_weights(schedule, step, eta))
+        by_clean, by_noisy, self.std = transition_weights(schedule, step, eta)
+        self.by = _constant(by_clean), _constant(by_noisy)
         self.is_last = step == 0
-        self.std = std if std > 0.0 else None
 
     def clean(self, noisy_action: np.ndarray, predicted: np.ndarray) -> np.ndarray:
         """The estimate of the clean action, not clipped."""
         return self.clean_by_noisy * noisy_action - self.clean_by_noise * predicted
 
-    def next(self, clean: np.ndarray, noisy_action: np.ndarray, noise: np.ndarray) -> np.ndarray:
-        """From a^k to a^(k-1)."""
+    def next(self, clean: np.ndarray, noisy_action: np.ndarray, scaled_noise: np.ndarray) -> np.ndarray:
+        """From a^k to a^(k-1); the noise has the step's standard deviation."""
         if self.is_last:
             return clean
         by_clean, by_noisy = self.by
         action = by_clean * clean
         action += by_noisy * noisy_action
-        if self.std is not None:
-            action += self.std * noise
+        action += scaled_noise
         return action
 
 
@@ -196,7 +195,12 @@ class _Denoiser:
         self.time_layers, self.layers = time_layers, layers
         self.activation = ACTIVATIONS[actor.activation_fn].value
         eta = 1.0 if actor.sampler == "ddpm" else actor.ddim_eta
-        self.steps = [_ReverseStep(actor.schedule, step, eta) for step in range(actor.schedule.n_steps)]
+        n_steps = actor.schedule.n_steps
+        self.steps = [_ReverseStep(actor.schedule, step, eta) for step in range(n_steps)]
+        # From the last step to the first; the one at position p scales the noise of row p + 1, and the very last one none
+        self.chain = [(k, self.steps[k]) for k in reversed(range(n_steps))]
+        self.stds = np.array([step.std for _, step in self.chain], dtype=np.float32)[:, None, None]
+        self.noise_rows = np.roll(np.arange(n_steps), -1)
         self.adapting_step = actor.adapting_step
 
     def time_part(self) -> np.ndarray:
@@ -226,17 +230,18 @@ class _Denoiser:
     ) -> np.ndarray:
         """
         The chain of :func:`sb3_causalgdp.diffusion.sample`; noise of shape ``(K, d, batch)``, actions ``(d, batch)``. What the
-        denoiser says of the start does not depend on the guidance, so a second chain need not ask again.
+        denoiser says of the start does not depend on the guidance, so a second chain need not ask again. ``shift`` says by how
+        much the guidance moves a clean estimate.
         """
-        action, n_steps = noise[0], len(noise)
-        for position, (k, step) in enumerate(reversed(list(enumerate(self.steps)))):
-            predicted = first_prediction if position == 0 else None
+        action, predicted = noise[0], first_prediction
+        scaled = self.stds * noise[self.noise_rows]
+        for position, (k, step) in enumerate(self.chain):
             if predicted is None:
                 predicted = self.predict_noise(action, bound[k])
             clean = step.clean(action, predicted)
             if shift is not None:
-                clean += step.clean_by_noise * shift(_clip_action(clean), k)
-            action = step.next(_clip_action(clean), action, noise[min(position + 1, n_steps - 1)])
+                clean += shift(_clip_action(clean), k)
+            action, predicted = step.next(_clip_action(clean), action, scaled[position]), None
         return action
 
     def adapt(self, features: np.ndarray, action: np.ndarray, time_part: np.ndarray) -> np.ndarray:
@@ -406,11 +411,12 @@ class _Rule:
         alpha_bar = np.array(schedule.alpha_bar_list, dtype=np.float32)[:, None, None, None]
         self.noise = 1.0 - alpha_bar
         scales = np.asarray(rule.scales, dtype=np.float32).reshape(-1, 1, 1, 1)
-        self.factor = scales * np.sqrt(self.noise * alpha_bar if rule.mode == "posterior" else self.noise)
+        # Taking sqrt(1 - alpha_bar) G off the noise adds (1 - alpha_bar) / sqrt(alpha_bar) G to the clean estimate
+        self.factor = scales * (self.noise if rule.mode == "posterior" else self.noise / np.sqrt(alpha_bar))
 
     def shift(self, best: np.ndarray, gradient: np.ndarray, curvature: np.ndarray) -> Callable[[np.ndarray, int], np.ndarray]:
         """
-        What the guidance takes off the predicted noise, as ``guidance_shift`` finds it.
+        How far the guidance moves the estimate of the clean action, from what ``guidance_shift`` takes off the noise.
 
         :param best: The action at which the guidance was taken, shape ``(batch, d)``
         :param gradient: Shape ``(batch, d)``
@@ -518,17 +524,16 @@ class NumpyActing:
         noise = noise.transpose(0, 2, 1)
         repeated = bound if n_candidates == 1 else np.repeat(bound, n_candidates, axis=2)
         first_prediction = self.denoiser.predict_noise(noise[0], repeated[-1])
-        candidates = self.denoiser.sample(repeated, noise, first_prediction)
-        best = np.arange(0, noise.shape[2], n_candidates)
+        action = self.denoiser.sample(repeated, noise, first_prediction).T
         if n_candidates > 1:
-            values = self.critics.values(features.T, candidates, n_candidates)
-            best = best + values.reshape(-1, n_candidates).argmax(axis=1)
-        action = candidates.T[best]
-        if not guided:
-            return action
-        assert self.rule is not None
-        shift = self.rule.shift(action, *self._local_model(policy, features, action, time_part))
-        return np.ascontiguousarray(self.denoiser.sample(bound, noise[:, :, best], first_prediction[:, best], shift).T)
+            values = self.critics.values(features.T, action.T, n_candidates).reshape(-1, n_candidates)
+            best = np.arange(0, len(action), n_candidates) + values.argmax(axis=1)
+            action, noise, first_prediction = action[best], noise[:, :, best], first_prediction[:, best]
+        if guided:
+            assert self.rule is not None
+            shift = self.rule.shift(action, *self._local_model(policy, features, action, time_part))
+            action = self.denoiser.sample(bound, noise, first_prediction, shift).T
+        return np.ascontiguousarray(action)
 
     def _local_model(
         self, policy: Policy, state: np.ndarray, action: np.ndarray, time_part: np.ndarray
