@@ -19,6 +19,7 @@ has_onednn = pytest.mark.skipif(products._onednn_product() is None, reason="this
 
 @pytest.fixture(autouse=True)
 def library_as_before():
+    use_library("auto")
     yield
     use_library("auto")
 

@@ -10,6 +10,7 @@ MISH_NETS = {"net_arch": LAYERS, "activation_fn": "mish"}
 
 DEFAULT = "CausalGDP, default"
 ONE_STEP = "CausalGDP, one_step, Mish 3x256"
+ONE_STEP_RELU = "CausalGDP, default, ReLU 3x256"
 CHAIN = "CausalGDP, chain, Mish 3x256"
 SAC = "SB3 SAC"
 SBX = "SBX SAC"
@@ -57,11 +58,16 @@ def main_settings() -> list[Contestant]:
     ]
 
 
+def one_step_relu() -> Contestant:
+    """The default with the layers of the peers."""
+    return causalgdp(ONE_STEP_RELU, policy_kwargs=SAME_NETS)
+
+
 def more_settings() -> list[Contestant]:
     """What takes longer, and what a call of ``train()`` costs."""
     return [
         causalgdp(f"{DEFAULT}, one update a call", one_at_a_time=True),
-        causalgdp("CausalGDP, default, ReLU 3x256", policy_kwargs=SAME_NETS),
+        one_step_relu(),
         causalgdp("CausalGDP, chain, Mish 3x256, no guidance", actor_update="chain", policy_kwargs=MISH_NETS, guidance=None),
     ]
 

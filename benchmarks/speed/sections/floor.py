@@ -7,7 +7,7 @@ import numpy as np
 from benchmarks.speed import contestants
 from benchmarks.speed.benchmark import HALF_CHEETAH, Benchmark
 from benchmarks.speed.client import Worker, median_ratio
-from benchmarks.speed.contestants import CHAIN, DEFAULT, ONE_STEP, compiled
+from benchmarks.speed.contestants import CHAIN, DEFAULT, ONE_STEP, ONE_STEP_RELU, compiled
 from benchmarks.speed.results import Row, Verdict, markdown
 
 COLUMNS = (
@@ -33,7 +33,7 @@ def run(benchmark: Benchmark) -> None:
     :param benchmark: What is shared
     """
     results = benchmark.results("floor")
-    ours = contestants.main_settings()
+    ours = [*contestants.main_settings(), contestants.one_step_relu()]
     who = [*benchmark.ours(ours), contestants.sb3("SAC"), *benchmark.diffusion_ql()]
     plain_of = {compiled(one.name): one.name for one in ours}
 
@@ -65,6 +65,8 @@ def run(benchmark: Benchmark) -> None:
     results.verdicts = [
         Verdict("floor: share that one_step, Mish 3x256 reaches", shares.get(ONE_STEP), 0.5, 0.7),
         Verdict("floor: share that one_step, Mish 3x256 reaches, compiled", shares.get(compiled(ONE_STEP)), 0.5, 0.7),
+        Verdict("floor: share that one_step, ReLU 3x256 reaches", shares.get(ONE_STEP_RELU), 0.5, 0.7),
+        Verdict("floor: share that one_step, ReLU 3x256 reaches, compiled", shares.get(compiled(ONE_STEP_RELU)), 0.5, 0.7),
         Verdict("floor: share that the default reaches", shares.get(DEFAULT), None),
         Verdict("floor: share that the default reaches, compiled", shares.get(compiled(DEFAULT)), None),
         Verdict("floor: share that the exact chain, Mish 3x256 reaches", shares.get(CHAIN), None),
