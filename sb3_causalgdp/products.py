@@ -2,8 +2,8 @@
 Linear layers by the faster of the two libraries that PyTorch has for a CPU.
 
 PyTorch multiplies 32-bit matrices with MKL. oneDNN is in PyTorch too and computes the same up to rounding: on AMD's processors
-with 512-bit vectors in half of the time, on Intel's in about the same. Which one is faster here is measured once, when the first
-large product is asked for; wherever oneDNN cannot be used, PyTorch's own way is taken.
+with 512-bit vectors in half of the time, on Intel's in about the same. Which one is faster here is measured once, when the
+first large product is asked for; wherever oneDNN cannot be used, PyTorch's own way is taken.
 """
 
 import time
@@ -14,6 +14,7 @@ from typing import Any
 import torch as th
 import torch.nn.functional as F
 from torch import nn
+from torch.utils._python_dispatch import _get_current_dispatch_mode
 
 LIBRARIES = ("auto", "default", "onednn")
 # Below it, a product with a thin matrix, the other library is as fast or faster
@@ -92,7 +93,7 @@ def linear(x: th.Tensor, weight: th.Tensor, bias: th.Tensor | None = None) -> th
     :param bias: Shape ``(outputs,)``
     :return: Shape ``(batch, outputs)``
     """
-    if th.compiler.is_compiling() or not _is_covered(x, weight):
+    if not _is_covered(x, weight):
         return F.linear(x, weight, bias)
     if th.is_grad_enabled() and (x.requires_grad or weight.requires_grad):
         return _Linear.apply(x, weight, bias)  # type: ignore[no-any-return]
@@ -125,14 +126,20 @@ def make_layers_fast(network: nn.Module) -> None:
 
 
 def _is_covered(x: th.Tensor, weight: th.Tensor) -> bool:
-    if x.ndim != 2 or x.dtype is not th.float32 or weight.dtype is not th.float32 or not x.is_cpu:
+    if _is_transformed() or x.ndim != 2 or x.dtype is not th.float32 or weight.dtype is not th.float32 or not x.is_cpu:
         return False
-    if min(*x.shape, len(weight)) < SMALLEST_SIZE or th.is_autocast_enabled("cpu"):
-        return False
-    # Forward-mode derivatives and vmap know PyTorch's own product alone
-    if th._C._functorch.maybe_current_level() is not None or th.autograd.forward_ad._current_level >= 0:
-        return False
-    return uses_onednn()
+    return min(*x.shape, len(weight)) >= SMALLEST_SIZE and not th.is_autocast_enabled("cpu") and uses_onednn()
+
+
+def _is_transformed() -> bool:
+    """Whether what is computed is traced, counted, mapped or differentiated forwards, which knows PyTorch's own product."""
+    return (
+        th.compiler.is_compiling()
+        or th.jit.is_tracing()
+        or _get_current_dispatch_mode() is not None
+        or th._C._functorch.maybe_current_level() is not None
+        or th.autograd.forward_ad._current_level >= 0
+    )
 
 
 def _product(x: th.Tensor, weight: th.Tensor, bias: th.Tensor | None = None) -> th.Tensor:

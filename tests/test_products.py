@@ -9,6 +9,7 @@ import pytest
 import torch as th
 import torch.nn.functional as F
 from torch import nn
+from torch.utils.flop_counter import FlopCounterMode
 
 from sb3_causalgdp import CausalGDP, products
 from sb3_causalgdp.gradients import compiled, gradients_of
@@ -106,13 +107,33 @@ def in_vmap(function, x, weight):
     return th.func.vmap(lambda inputs: function(inputs, weight))(x.expand(3, -1, -1))
 
 
+def in_a_trace(function, x, weight):
+    # Otherwise it runs the plain function once more, to compare
+    return th.jit.trace(function, (x, weight), check_trace=False)(x, weight)
+
+
+def in_an_exported_program(function, x, weight):
+    class Module(nn.Module):
+        def forward(self, x, weight):
+            return function(x, weight)
+
+    return th.export.export(Module(), (x, weight)).module()(x, weight)
+
+
+def in_a_counter(function, x, weight):
+    with FlopCounterMode(display=False) as counter:
+        y = function(x, weight)
+    assert counter.get_total_flops() == 2 * 32**3
+    return y
+
+
 def in_autocast(function, x, weight):
     with th.autocast("cpu", dtype=th.bfloat16):
         return function(x, weight)
 
 
 @has_onednn
-@pytest.mark.parametrize("way", [in_forward_mode, in_vmap, in_autocast])
+@pytest.mark.parametrize("way", [in_forward_mode, in_vmap, in_autocast, in_a_trace, in_an_exported_program, in_a_counter])
 def test_what_onednn_cannot_do_is_left_to_pytorch(way, onednn_calls):
     x, weight = th.randn(32, 32), th.randn(32, 32)
     with th.no_grad():

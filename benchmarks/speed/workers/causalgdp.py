@@ -7,8 +7,6 @@ Arguments that the installed version does not have are told apart: what asks for
 
 import inspect
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import asdict
 from typing import Any
 
@@ -21,7 +19,6 @@ from benchmarks.speed.workers.torch_contestant import TorchContestant
 from sb3_causalgdp import CausalGDP
 from sb3_causalgdp.callbacks import CausalWorldModelCallback
 from sb3_causalgdp.causal import discover
-from sb3_causalgdp.products import use_library
 
 BEHAVIOUR_WITHOUT_ARGUMENT = {"actor_update": "chain", "compile": False}
 
@@ -64,16 +61,6 @@ class CausalGDPContestant(OffPolicyContestant, TorchContestant):
         settings["guided"] = bool(policy.is_guided)
         return {**super().about(), "settings": settings}
 
-    def flops(self) -> dict[str, float]:
-        """As PyTorch multiplies by itself, because its counters know no other products."""
-        with _default_products():
-            return super().flops()
-
-    def products(self) -> dict[str, float]:
-        """See :meth:`flops`."""
-        with _default_products():
-            return super().products()
-
     def learn(self, steps: int) -> dict[str, Any]:
         """
         Go on learning.
@@ -109,15 +96,6 @@ class CausalGDPContestant(OffPolicyContestant, TorchContestant):
         functions = {name: {key: value / n for key, value in asdict(taken).items()} for name, taken in timer.functions.items()}
         parts = {name: seconds / n for name, seconds in timer.seconds.items()}
         return {"plain": (middle - start) / n, "wrapped": (end - begin) / n, "parts": parts, "functions": functions}
-
-
-@contextmanager
-def _default_products() -> Iterator[None]:
-    use_library("default")
-    try:
-        yield
-    finally:
-        use_library("auto")
 
 
 def supported(kwargs: dict[str, Any]) -> dict[str, Any]:
