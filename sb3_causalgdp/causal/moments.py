@@ -8,6 +8,7 @@ import torch as th
 LARGEST_VALUE = 1e140  # so that the sum of squares stays inside float64
 CONSTANT_FLOOR = 1e-10  # a million times float64's rounding, yet below a sensor at 1e6 with sd 1e-3
 FIRST_BLOCK_ROWS = 8  # so that a jackknife has blocks to leave out from the first graph on
+MANY_ROWS = 128  # from where half of a product costs more time than another matrix of its size
 FORGOTTEN = 1e-9  # weight of a block, relative to that of the newest batch, that says nothing any more
 
 
@@ -159,12 +160,17 @@ def _between(parts: Sequence[Spread]) -> tuple[Spread, np.ndarray]:
 
 
 def _add_products(deviations: np.ndarray, comoment: np.ndarray, cross: np.ndarray) -> None:
-    """In place: another matrix of this size would be felt. By torch, whose product of matrices is faster than numpy's."""
-    values, n_inputs = th.from_numpy(deviations), len(comoment)
-    inputs, targets = values[:, :n_inputs], values[:, n_inputs:]
-    th.from_numpy(comoment).addmm_(inputs.T, inputs)
+    """In place."""
+    n_inputs = len(comoment)
+    inputs, targets = deviations[:, :n_inputs], deviations[:, n_inputs:]
+    if len(deviations) >= MANY_ROWS:
+        # Numpy computes one half of a product of a matrix with itself, and copies the other
+        comoment += inputs.T @ inputs
+    else:
+        # Torch adds without another matrix of this size, which would be felt more than the other half
+        th.from_numpy(comoment).addmm_(th.from_numpy(inputs).T, th.from_numpy(inputs))
     if targets.shape[1] > 0:
-        th.from_numpy(cross).addmm_(inputs.T, targets)
+        th.from_numpy(cross).addmm_(th.from_numpy(inputs).T, th.from_numpy(targets))
 
 
 class StreamingMoments:

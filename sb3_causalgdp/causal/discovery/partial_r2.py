@@ -296,7 +296,7 @@ class _Regression:
             squares.append(of_block)
         scores *= th.from_numpy(self.inverse_scale)[:, None, None]
         # One product for all blocks: each alone would read the whole inverse
-        steps = (self.inverse @ scores.flatten(1)).view_as(scores)
+        steps = th.from_numpy(self.inverse.numpy() @ scores.flatten(1).numpy()).view_as(scores)
         del scores
         for i, (block, rest) in enumerate(zip(self.blocks, leave_one_out(self.blocks), strict=True)):
             residual = np.sum(squares[:i] + squares[i + 1 :], axis=0) / rest.count
@@ -379,7 +379,7 @@ class _Regression:
         """
         raw = self.raw_coefficients
         cross = th.from_numpy(block.cross / self.target_scale)
-        scores = th.addmm(cross, th.from_numpy(block.comoment), raw, alpha=-1.0)
+        scores = cross - th.from_numpy(block.comoment @ raw.numpy())
         squares = block.squares[self.n_features :] / self.target_scale**2
         squares = squares - (raw * (cross + scores)).sum(dim=0).numpy()
         # The block's means are not those of all rows
