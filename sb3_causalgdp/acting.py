@@ -31,7 +31,8 @@ def _constant(value: float) -> np.ndarray:
     return np.array(value, dtype=np.float32)
 
 
-_ZERO, _ONE, _MINUS_ONE = _constant(0.0), _constant(1.0), _constant(-1.0)
+_ZERO, _ONE, _MINUS_ONE, _TWO = _constant(0.0), _constant(1.0), _constant(-1.0), _constant(2.0)
+_LARGEST_EXPONENT = _constant(20.0)
 _ROUNDING = _constant(8.0 * float(np.finfo(np.float32).eps))
 _SMALLEST_STD, _MOST_CHANGE = _constant(1e-4), _constant(4.0)  # those of MaskedWorldModel
 
@@ -50,9 +51,12 @@ def _sigmoid(x: np.ndarray) -> np.ndarray:
 
 def _tanh_of_softplus(x: np.ndarray) -> np.ndarray:
     # tanh(log(1 + e)) = ((1 + e)^2 - 1) / ((1 + e)^2 + 1): one exponential; beyond 20 it is 1 in float32
-    exponential = np.exp(np.minimum(x, 20.0))
-    numerator = exponential * (exponential + 2.0)
-    return numerator / (numerator + 2.0)
+    exponential = np.minimum(x, _LARGEST_EXPONENT)
+    np.exp(exponential, out=exponential)
+    result = exponential + _TWO
+    result *= exponential
+    result /= result + _TWO
+    return result
 
 
 def _mish_derivative(x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -460,9 +464,8 @@ class NumpyActing:
         self.rule = None if rule is None else _Rule(rule, policy.actor.schedule, policy.actor.action_dim)
         self._blas = ThreadpoolController().select(user_api="blas")
         self._modules = self._modules_of(policy)
-        tensors = (tensor for module in self._modules for tensor in (*module.parameters(), *module.buffers()))
-        self._find_addresses = [tensor.data_ptr for tensor in tensors]
-        self._addresses = [find() for find in self._find_addresses]
+        self._tensors = [tensor for module in self._modules for tensor in (*module.parameters(), *module.buffers())]
+        self._addresses = list(map(th.Tensor.data_ptr, self._tensors))
 
     @staticmethod
     def _modules_of(policy: Policy) -> tuple[nn.Module, ...]:
@@ -478,7 +481,7 @@ class NumpyActing:
         :return: Whether the views are still those of its networks, which may have been moved or replaced
         """
         same = all(ours is theirs for ours, theirs in zip(self._modules, self._modules_of(policy), strict=True))
-        return same and [find() for find in self._find_addresses] == self._addresses
+        return same and list(map(th.Tensor.data_ptr, self._tensors)) == self._addresses
 
     @staticmethod
     def covers(policy: Policy) -> bool:
