@@ -20,7 +20,7 @@ from torch import nn
 
 from sb3_causalgdp.causal.world_model import MaskedBlocks, MaskedWorldModel
 from sb3_causalgdp.diffusion import GuidanceRule, MLPDenoiser, NoiseSchedule
-from sb3_causalgdp.diffusion.activations import fast
+from sb3_causalgdp.activations import fast
 from sb3_causalgdp.diffusion.samplers import transition_weights
 
 Policy = Any  # a CausalGDPPolicy, whose file imports this one

@@ -23,7 +23,7 @@ from sb3_causalgdp.causal import CausalGuidance, LinearisedGuidance, MaskedWorld
 from sb3_causalgdp.causal.guidance import OutcomeTarget
 from sb3_causalgdp.checks import check_at_least_zero
 from sb3_causalgdp.diffusion import Guidance, GuidanceRule, MLPDenoiser, NoiseSchedule, sample
-from sb3_causalgdp.diffusion.activations import fast
+from sb3_causalgdp.activations import fast
 from sb3_causalgdp.diffusion.samplers import bind, check_sampler
 from sb3_causalgdp.products import make_layers_fast
 

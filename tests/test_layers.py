@@ -18,9 +18,9 @@ LAYERS = [
     {"policies"},
     {"acting"},
     {"causal", "offline", "diffusion"},
-    {"checks", "products"},
+    {"checks", "products", "activations"},
 ]
-WITHOUT_SB3 = {"causal", "diffusion", "losses", "gradients", "products", "product_pass"}
+WITHOUT_SB3 = {"causal", "diffusion", "losses", "gradients", "products", "product_pass", "activations"}
 LEVELS = {part: level for level, parts in enumerate(LAYERS) for part in parts}
 FILES = sorted(PACKAGE.rglob("*.py"))
 

@@ -6,6 +6,7 @@ from typing import NamedTuple
 import torch as th
 from torch import nn
 
+from sb3_causalgdp.activations import tanh_
 from sb3_causalgdp.products import linear
 
 
@@ -50,9 +51,9 @@ class MaskedBlocks(nn.Module):
         """Each of shape ``(m, batch, w)``: in this order, no product of the forward and backward pass needs a copy."""
         # tanh is smooth, as a Jacobian has to be, and cheaper than GELU or SiLU
         # In place: half of the memory, which then stays in the cache
-        layers = [self._first_layer(inputs, weight).tanh_()]
+        layers = [tanh_(self._first_layer(inputs, weight))]
         for hidden_weight, bias in zip(self.hidden_weights, self.hidden_biases, strict=True):
-            layers.append(th.baddbmm(bias, layers[-1], hidden_weight).tanh_())
+            layers.append(tanh_(th.baddbmm(bias, layers[-1], hidden_weight)))
         return layers
 
     def _outputs(self, hidden: th.Tensor) -> th.Tensor:
@@ -97,9 +98,9 @@ class ManyMaskedBlocks(MaskedBlocks):
 
     def _hidden_layers(self, inputs: th.Tensor, weight: th.Tensor) -> list[th.Tensor]:
         first = linear(weight.flatten(0, 1), inputs) + self.input_layer.bias.unsqueeze(1)
-        layers = [first.view(self.n_outputs, self.width, -1).tanh_()]
+        layers = [tanh_(first.view(self.n_outputs, self.width, -1))]
         for hidden_weight, bias in zip(self.hidden_weights, self.hidden_biases, strict=True):
-            layers.append(th.baddbmm(bias.mT, hidden_weight.mT, layers[-1]).tanh_())
+            layers.append(tanh_(th.baddbmm(bias.mT, hidden_weight.mT, layers[-1])))
         return layers
 
     def _outputs(self, hidden: th.Tensor) -> th.Tensor:

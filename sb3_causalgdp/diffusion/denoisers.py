@@ -7,7 +7,7 @@ from itertools import pairwise
 import torch as th
 from torch import nn
 
-from sb3_causalgdp.diffusion.activations import fast
+from sb3_causalgdp.activations import fast
 from sb3_causalgdp.products import Linear, linear
 
 

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from functools import partial
 from typing import Any
+import math
 
 import torch as th
 from torch import nn
@@ -10,6 +11,48 @@ from torch.autograd.function import once_differentiable
 
 # From here on Mish is its input, also in double precision
 _LARGEST_EXPONENT = 20.0
+_LOG2_E = 1.0 / math.log(2.0)
+
+
+def exponential(x: th.Tensor) -> th.Tensor:
+    """
+    ``exp(x)`` as a power of 2. That one PyTorch computes with vectorised code of its own; for ``exp``, ``tanh`` and others it
+    asks MKL, which takes several times as long on AMD's processors.
+
+    :param x: Any shape
+    :return: The same shape, a tensor of its own; the relative error grows with ``|x|``, as if ``x`` were rounded once more
+    """
+    return (x * _LOG2_E).exp2_()
+
+
+def tanh_(x: th.Tensor) -> th.Tensor:
+    """
+    ``tanh(x) = 2 sigmoid(2 x) - 1``, see :func:`exponential`; the absolute error is that of rounding 1.
+
+    :param x: Any shape; overwritten on a CPU
+    :return: The same shape
+    """
+    if th.compiler.is_compiling():
+        return 2.0 * th.sigmoid(2.0 * x) - 1.0
+    if x.device.type != "cpu":
+        return x.tanh_()
+    return _TanhFunction.apply(x) if th.is_grad_enabled() and x.requires_grad else _tanh_in_place(x)  # type: ignore[no-any-return]
+
+
+def _tanh_in_place(x: th.Tensor) -> th.Tensor:
+    return x.mul_(2.0).sigmoid_().mul_(2.0).sub_(1.0)
+
+
+class _TanhFunction(th.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, x: th.Tensor) -> th.Tensor:  # type: ignore[override]
+        ctx.mark_dirty(x)
+        ctx.save_for_backward(_tanh_in_place(x))
+        return x
+
+    @staticmethod
+    def backward(ctx: Any, gradient: th.Tensor) -> th.Tensor:  # type: ignore[override]
+        return th.ops.aten.tanh_backward(gradient, *ctx.saved_tensors)
 
 
 def mish(x: th.Tensor) -> th.Tensor:
@@ -20,7 +63,7 @@ def mish(x: th.Tensor) -> th.Tensor:
     :return: The same shape; the absolute error is that of rounding ``x``
     """
     # In place: what is new has to be fetched into the cache first. Infinite where exp overflows, which leaves x
-    denominator = x.exp().add_(1.0).square_().add_(1.0)
+    denominator = exponential(x).add_(1.0).square_().add_(1.0)
     return th.addcdiv(x, x, denominator, value=-2.0)
 
 
@@ -31,7 +74,7 @@ def mish_and_slope(x: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
     :param x: Any shape
     :return: Mish and ``w``, of the same shape
     """
-    s = x.clamp(max=_LARGEST_EXPONENT).exp_().add_(1.0)
+    s = exponential(x.clamp(max=_LARGEST_EXPONENT)).add_(1.0)
     r = s.square().add_(1.0).reciprocal_()
     w = x * r
     value = th.sub(x, w, alpha=2.0)

@@ -5,7 +5,7 @@ import torch as th
 import torch.nn.functional as F
 from torch import nn
 
-from sb3_causalgdp.diffusion.activations import FastMish, fast
+from sb3_causalgdp.activations import FastMish, exponential, fast, tanh_
 from sb3_causalgdp.diffusion.denoisers import MLPDenoiser
 
 
@@ -48,3 +48,36 @@ def test_networks_of_the_user_s_mish_are_fast_and_keep_their_weights_names():
 def test_other_activations_are_themselves():
     assert fast(nn.Tanh) is nn.Tanh
     assert type(fast(nn.ReLU)()) is nn.ReLU
+
+
+@pytest.mark.parametrize("dtype, tolerance", [(th.float32, 2e-6), (th.float64, 1e-14)])
+def test_exponentials_are_those_of_pytorch(dtype, tolerance):
+    x = th.linspace(-20.0, 20.0, 10_001, dtype=dtype)
+    before = x.clone()
+    th.testing.assert_close(exponential(x), x.exp(), rtol=2 * tolerance, atol=0)
+    assert th.equal(x, before)
+    assert exponential(th.tensor([-1e4, 1e4], dtype=dtype)).tolist() == [0.0, float("inf")]
+
+
+@pytest.mark.parametrize("is_compiling", [False, True])
+@pytest.mark.parametrize("dtype, tolerance", [(th.float32, 4e-7), (th.float64, 1e-15)])
+def test_tanh_and_its_derivatives_are_those_of_pytorch(dtype, tolerance, is_compiling, monkeypatch):
+    monkeypatch.setattr(th.compiler, "is_compiling", lambda: is_compiling)
+    x = th.linspace(-90.0, 90.0, 20_001, dtype=dtype, requires_grad=True)
+    ours, theirs = tanh_(x.clone()), x.tanh()
+    th.testing.assert_close(ours, theirs, rtol=0, atol=tolerance)
+    first = [th.autograd.grad(y.square().sum(), x, create_graph=True)[0] for y in (ours, theirs)]
+    th.testing.assert_close(*first, rtol=0, atol=4 * tolerance)
+    second = [th.autograd.grad(slope.sum(), x)[0] for slope in first]
+    th.testing.assert_close(*second, rtol=0, atol=20 * tolerance)
+
+
+def test_tanh_writes_over_what_it_is_given():
+    x = th.randn(50)
+    expected = x.tanh()
+    with th.no_grad():
+        assert tanh_(x) is x
+    th.testing.assert_close(x, expected)
+    leaf = th.randn(50, requires_grad=True)
+    hidden = leaf * 1.0
+    assert tanh_(hidden).data_ptr() == hidden.data_ptr()
