@@ -18,9 +18,9 @@ from stable_baselines3.common.torch_layers import FlattenExtractor
 from threadpoolctl import ThreadpoolController
 from torch import nn
 
+from sb3_causalgdp.activations import fast
 from sb3_causalgdp.causal.world_model import MaskedBlocks, MaskedWorldModel
 from sb3_causalgdp.diffusion import GuidanceRule, MLPDenoiser, NoiseSchedule
-from sb3_causalgdp.activations import fast
 from sb3_causalgdp.diffusion.samplers import transition_weights
 
 Policy = Any  # a CausalGDPPolicy, whose file imports this one

@@ -1,9 +1,9 @@
 """Activations that compute the same as PyTorch's in less time."""
 
+import math
 from collections.abc import Callable
 from functools import partial
 from typing import Any
-import math
 
 import torch as th
 from torch import nn

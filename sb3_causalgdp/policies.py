@@ -19,11 +19,11 @@ from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
 from sb3_causalgdp.acting import NumpyActing
+from sb3_causalgdp.activations import fast
 from sb3_causalgdp.causal import CausalGuidance, LinearisedGuidance, MaskedWorldModel, ReturnTarget, RewardTarget
 from sb3_causalgdp.causal.guidance import OutcomeTarget
 from sb3_causalgdp.checks import check_at_least_zero
 from sb3_causalgdp.diffusion import Guidance, GuidanceRule, MLPDenoiser, NoiseSchedule, sample
-from sb3_causalgdp.activations import fast
 from sb3_causalgdp.diffusion.samplers import bind, check_sampler
 from sb3_causalgdp.products import make_layers_fast
 
