@@ -150,7 +150,7 @@ def draw_scores(table: pd.DataFrame, path: Path) -> None:
 
 
 def _figure(n_panels: int) -> Figure:
-    figure = Figure(figsize=(1.5 + 4 * n_panels, 4.6), layout="constrained")
+    figure = Figure(figsize=(1.5 + 4 * n_panels, 5.2), layout="constrained")
     FigureCanvasAgg(figure)
     return figure
 
@@ -162,7 +162,8 @@ def _save(figure: Figure, path: Path) -> None:
         assert isinstance(axes, Axes)
         for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
             handles.setdefault(label, handle)
-    figure.legend(list(handles.values()), list(handles), loc="outside lower center", ncols=4, frameon=False)
+    n_columns = min(len(figure.axes) + 1, 4)  # more than fit would be cut off
+    figure.legend(list(handles.values()), list(handles), loc="outside lower center", ncols=n_columns, frameon=False)
     save_figure(figure, path)
 
 
