@@ -42,8 +42,7 @@ class DeviceReplay:
         if device.type != "cuda" or not cls.has_plain_rows(buffer):
             return False
         free, _ = th.cuda.mem_get_info(device)
-        arrays = (values for column in _columns(buffer).values() for values in _leaves(column))
-        needed = sum(values.size * _dtype_of(values).itemsize for values in arrays)
+        needed = sum(values.size * _dtype_of(values).itemsize for values in _arrays(buffer))
         return needed <= cls.LARGEST_SHARE * free
 
     @staticmethod
@@ -99,7 +98,7 @@ class DeviceReplay:
         return not all(np.array_equal(old, new, equal_nan=True) for old, new in zip(self._newest, now, strict=True))
 
     def _row_before(self, position: int) -> list[np.ndarray]:
-        return [values[position - 1].copy() for column in _columns(self.buffer).values() for values in _leaves(column)]
+        return [values[position - 1].copy() for values in _arrays(self.buffer)]
 
     def _copy(self, first: int, end: int) -> None:
         if first == end:
@@ -115,6 +114,11 @@ class DeviceReplay:
 def _columns(buffer: ReplayBuffer) -> Columns:
     names = ("observations", "actions", "next_observations", "dones", "timeouts", "rewards")
     return {name: getattr(buffer, name) for name in names}
+
+
+def _arrays(buffer: ReplayBuffer) -> Iterator[np.ndarray]:
+    for column in _columns(buffer).values():
+        yield from _leaves(column)
 
 
 def _dtype_of(values: np.ndarray) -> th.dtype:

@@ -143,9 +143,7 @@ def _is_transformed() -> bool:
 
 
 def _product(x: th.Tensor, weight: th.Tensor, bias: th.Tensor | None = None) -> th.Tensor:
-    """``x w^T + b`` by oneDNN, where that is worth it for these shapes."""
-    if min(*x.shape, len(weight)) < SMALLEST_SIZE:
-        return F.linear(x, weight, bias)
+    """``x w^T + b`` by oneDNN."""
     # oneDNN needs milliseconds for a part of a larger matrix
     return _onednn_product()(_whole(x), _whole(weight), bias)  # type: ignore[misc]
 
@@ -172,7 +170,7 @@ class _Linear(th.autograd.Function):
     def backward(ctx: Any, gradient: th.Tensor) -> tuple[th.Tensor | None, ...]:  # type: ignore[override]
         x, weight = ctx.saved_tensors
         by_x, by_weight, by_bias = ctx.needs_input_grad
-        # With a graph, for derivatives of derivatives, these are layers again
+        # The same three sizes, so as large as forward. With a graph, for derivatives of derivatives, these are layers again
         product = linear if th.is_grad_enabled() else _product
         return (
             product(gradient, weight.t()) if by_x else None,
