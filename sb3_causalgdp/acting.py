@@ -3,9 +3,11 @@ Prediction for few observations, in numpy.
 
 For a handful of rows, nearly all of the time that PyTorch needs goes into dispatching hundreds of small operations. Here the
 same numbers are computed on the same memory: the arrays are views of the networks' weights, so nothing is copied and nothing
-gets out of date while they are trained. What is not covered is left to the plain path, see :meth:`NumpyActing.covers`.
+gets out of date while they are trained. From a GPU, the weights are copied in one piece for each prediction. What is not
+covered is left to the plain path, see :meth:`NumpyActing.covers`.
 """
 
+import copy
 from collections.abc import Callable, Sequence
 from functools import reduce
 from itertools import pairwise
@@ -446,25 +448,64 @@ def _unit(rows: np.ndarray) -> np.ndarray:
     return rows / np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-8)
 
 
+class HostCopy:
+    """
+    A policy's networks in the processor's own memory.
+
+    :param policy: The policy, on any device
+    """
+
+    def __init__(self, policy: Policy) -> None:
+        networks = policy.actor, policy.critic, policy.world_model
+        self.policy = copy.deepcopy(policy, {id(network.optimizer): None for network in networks}).to("cpu")
+        self._there = self.tensors_of(policy)
+        here = self.tensors_of(self.policy)
+        sizes = [tensor.numel() for tensor in here]
+        # Pinned memory is written by the GPU itself
+        self._memory = th.empty(sum(sizes), pin_memory=policy.device.type == "cuda")
+        for tensor, part in zip(here, self._memory.split(sizes), strict=True):
+            tensor.data = part.view_as(tensor)
+        self.refresh()
+
+    @staticmethod
+    def tensors_of(policy: Policy) -> list[th.Tensor]:
+        """
+        :param policy: A policy
+        :return: All that acting reads of it
+        """
+        modules = policy.actor.denoiser, policy.critic_target, policy.world_model
+        tensors = [tensor for module in modules for tensor in (*module.parameters(), *module.buffers())]
+        return [*tensors, policy.return_std, policy.reward_target]
+
+    @th.no_grad()
+    def refresh(self) -> None:
+        """Copy what the networks are now."""
+        self._memory.copy_(th.cat([tensor.reshape(-1) for tensor in self._there]))
+
+
 class NumpyActing:
     """
-    What :meth:`CausalGDPPolicy._act` computes, for few rows on a CPU.
+    What :meth:`CausalGDPPolicy._act` computes, for few rows.
 
     :param policy: A policy that :meth:`covers` accepts
+    :param copies: Whether to compute on a copy of its weights; by default where they are not in the processor's memory
     """
 
     # Rows of candidates up to which this is faster than PyTorch, see benchmarks/speed
     MOST_ROWS = 640
 
-    def __init__(self, policy: Policy) -> None:
-        self.denoiser = _Denoiser(policy)
-        self.critics = _Critics(policy)
-        self.world_model = _WorldModel(policy.world_model)
+    def __init__(self, policy: Policy, copies: bool | None = None) -> None:
+        self._copy = HostCopy(policy) if copies or (copies is None and policy.device.type != "cpu") else None
+        near = policy if self._copy is None else self._copy.policy
+        self.denoiser = _Denoiser(near)
+        self.critics = _Critics(near)
+        self.world_model = _WorldModel(near.world_model)
+        self.return_std, self.reward_target = _view(near.return_std), _view(near.reward_target)
         rule = policy.guidance_rule
         self.rule = None if rule is None else _Rule(rule, policy.actor.schedule, policy.actor.action_dim)
         self._blas = ThreadpoolController().select(user_api="blas")
         self._modules = self._modules_of(policy)
-        self._tensors = [tensor for module in self._modules for tensor in (*module.parameters(), *module.buffers())]
+        self._tensors = HostCopy.tensors_of(policy)
         self._addresses = list(map(th.Tensor.data_ptr, self._tensors))
 
     @staticmethod
@@ -487,14 +528,14 @@ class NumpyActing:
     def covers(policy: Policy) -> bool:
         """
         :param policy: A policy
-        :return: Whether this class can act for it: vectors of observations as they are, plain layers in float32 on a CPU, and
-            a guidance without the denoiser's Jacobian
+        :return: Whether this class can act for it: vectors of observations as they are, plain layers in float32 on a CPU or a
+            GPU of CUDA, and a guidance without the denoiser's Jacobian
         """
         rule, activation = policy.guidance_rule, policy.activation_fn
         critics = (_without_norms(network)[0] for network in policy.critic_target.q_networks)
         networks: list[Any] = [policy.actor.denoiser.network, *critics]
         return (
-            policy.device.type == "cpu"
+            policy.device.type in ("cpu", "cuda")
             and type(policy.observation_space) is spaces.Box
             and not policy.has_image_state
             and type(policy.actor.features_extractor) is FlattenExtractor
@@ -514,6 +555,8 @@ class NumpyActing:
         :param guided: Whether the guidance is on
         :return: Actions in [-1, 1], shape ``(batch, d)``
         """
+        if self._copy is not None:
+            self._copy.refresh()
         # On products this small, several threads of numpy's library mostly wait for each other: ten times the time
         if all(library.num_threads == 1 for library in self._blas.lib_controllers):
             return self._act(policy, features, noise, guided)
@@ -545,11 +588,11 @@ class NumpyActing:
         response = self.world_model.response(state, action)
         by_next_state, by_action = response["reward_by_next_state"], response["reward_by_action"]
         if policy.guidance_target == "return":
-            error, std = _ONE, _view(policy.return_std)
+            error, std = _ONE, self.return_std
             by_next_state = by_next_state + np.float32(policy.discount) * self._value_gradient(response, action, time_part)
         else:
             std = response["reward_std"]
-            error = ((_view(policy.reward_target) - response["reward"]) / std)[:, None]
+            error = ((self.reward_target - response["reward"]) / std)[:, None]
         to_state = response["standardised_jacobian"]
         jacobian = (by_action + ((by_next_state * response["next_state_std"])[:, None] @ to_state)[:, 0]) / std
         scale = np.float32(policy.outcome_guidance_scale)

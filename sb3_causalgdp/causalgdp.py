@@ -3,8 +3,9 @@
 import io
 import pathlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from typing import Any, ClassVar, TypeVar
+from contextlib import contextmanager, nullcontext
+from functools import partial
+from typing import Any, ClassVar, NamedTuple, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -33,6 +34,7 @@ from sb3_causalgdp.causal.graph import replaced_when_done
 from sb3_causalgdp.causal.interventions import ActionRule
 from sb3_causalgdp.causal.world_model import MaskedWorldModel
 from sb3_causalgdp.checks import check_at_least_zero, is_count
+from sb3_causalgdp.cuda_graphs import UpdateGraphs, why_not_recorded
 from sb3_causalgdp.device_replay import DeviceReplay
 from sb3_causalgdp.gradients import Gradients, check_compile, compiled, gradients_of
 from sb3_causalgdp.losses import critic_loss, denoising_loss, q_loss, td_target, world_model_loss
@@ -45,6 +47,17 @@ ACTOR_UPDATES = ("one_step", "chain")
 COMPILED = ("_critic_gradients", "_world_model_gradients", "_actor_gradients")
 
 SelfCausalGDP = TypeVar("SelfCausalGDP", bound="CausalGDP")
+
+
+class StepPlan(NamedTuple):
+    """What one gradient step does beside updating the critics."""
+
+    trains_world_model: bool
+    trains_actor: bool
+    guided: bool
+    """Whether the denoising term is steered."""
+    climbed: int
+    """The critic whose value the actor climbs."""
 
 
 class CausalGDP(OfflineToOnlineAlgorithm):
@@ -132,6 +145,10 @@ class CausalGDP(OfflineToOnlineAlgorithm):
         one graph for the loss and the gradients of each network, with the world model and the guidance in it. The first
         updates then take a minute or two; the numbers are the same up to rounding. Saved models do not depend on it. Needs
         PyTorch 2.13 and, on a CPU, a C++ compiler
+    :param cuda_graph: Whether gradient steps behind the first hundred are recorded as CUDA graphs and replayed, with
+        ``compile`` or without: on a GPU the launches of their kernels, and not their work, are what takes time. The numbers
+        are those of the plain steps. ``"auto"`` is True on a GPU, unless the replay buffer is the memory efficient one, an
+        optimizer cannot be recorded, or ``compile`` makes CUDA graphs itself
     :param torch_threads: PyTorch's number of CPU threads during updates; None leaves it as it is. ``"auto"`` is 1 where
         observations are vectors, whose networks are so small that threads only wait for each other, and otherwise None
     :param verbose: Verbosity level: 0 for no output, 1 for info messages (such as device or wrappers used), 2 for debug
@@ -213,6 +230,7 @@ class CausalGDP(OfflineToOnlineAlgorithm):
         tensorboard_log: str | None = None,
         policy_kwargs: dict[str, Any] | None = None,
         compile: bool | str = False,
+        cuda_graph: bool | str = "auto",
         torch_threads: int | str | None = "auto",
         verbose: int = 0,
         seed: int | None = None,
@@ -277,6 +295,7 @@ class CausalGDP(OfflineToOnlineAlgorithm):
         self.causal_window = causal_window
         self.sample_masks = sample_masks
         self.compile = compile
+        self.cuda_graph = cuda_graph
         self.torch_threads = torch_threads
         # What is known of the causal structure, saved with the model
         self.causal_statistics: Statistics | None = None
@@ -295,6 +314,7 @@ class CausalGDP(OfflineToOnlineAlgorithm):
         check_compile(self.compile, self.device)
         if _init_setup_model:
             self._setup_model()
+            self._check_cuda_graph()
 
     def _setup_model(self) -> None:
         self._check_arguments()
@@ -307,6 +327,7 @@ class CausalGDP(OfflineToOnlineAlgorithm):
             self.policy_kwargs = policy_kwargs
         self._create_aliases()
         self._setup_compile()
+        self._setup_cuda_graphs()
         self._setup_discovery()
         # Running mean and running var
         self.actor_batch_norm_stats = get_parameters_by_name(self.actor, ["running_"])
@@ -318,6 +339,21 @@ class CausalGDP(OfflineToOnlineAlgorithm):
         for name in COMPILED:
             function = getattr(type(self), name).__get__(self)
             setattr(self, name, compiled(function, self.compile, self.device) if self.compile else function)
+
+    def _setup_cuda_graphs(self) -> None:
+        recorded = self.cuda_graph and self._why_not_recorded() is None
+        self._update_graphs = UpdateGraphs(self._optimizers()) if recorded else None
+
+    def _optimizers(self) -> list[th.optim.Optimizer]:
+        return [_optimizer_of(module) for module in (self.actor, self.critic, self.world_model)]
+
+    def _why_not_recorded(self) -> str | None:
+        return why_not_recorded(self.device, self.compile, self.optimize_memory_usage, self._optimizers())
+
+    def _check_cuda_graph(self) -> None:
+        reason = self._why_not_recorded() if self.cuda_graph is True else None
+        if reason is not None:
+            raise ValueError(reason)
 
     def _setup_discovery(self) -> None:
         self.discovery = make_discovery(self.causal_discovery, **self.causal_discovery_kwargs)
@@ -350,6 +386,8 @@ class CausalGDP(OfflineToOnlineAlgorithm):
             raise ValueError(f"torch_threads must be 'auto', None or an integer of at least 1, got {threads!r}")
         if self.max_grad_norm is not None and self.max_grad_norm <= 0.0:
             raise ValueError(f"max_grad_norm must be positive or None, got {self.max_grad_norm!r}")
+        if not (isinstance(self.cuda_graph, bool) or self.cuda_graph == "auto"):
+            raise ValueError(f"cuda_graph must be True, False or 'auto', got {self.cuda_graph!r}")
 
     def _own_policy_kwargs(self) -> dict[str, Any]:
         names = (
@@ -364,6 +402,9 @@ class CausalGDP(OfflineToOnlineAlgorithm):
         self.critic = self.policy.critic
         self.critic_target = self.policy.critic_target
         self.world_model = self.policy.world_model
+        networks = (self.actor, self.actor_target, self.critic, self.critic_target, self.world_model)
+        # Once, because to visit all modules takes a hundredth of a gradient step
+        self._parameters: dict[th.nn.Module, list[th.Tensor]] = {network: [*network.parameters()] for network in networks}
 
     def _setup_lr_schedule(self) -> None:
         super()._setup_lr_schedule()
@@ -384,8 +425,9 @@ class CausalGDP(OfflineToOnlineAlgorithm):
         update_learning_rate(_optimizer_of(self.world_model), self.world_model_lr_schedule(progress))
 
     def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
-        # Again, for models that were loaded: those that are not trained need no compiler
+        # Again, for models that were loaded: those that are not trained need no compiler and no GPU
         check_compile(self.compile, self.device)
+        self._check_cuda_graph()
         callbacks = callback_list(callback)
         n_own = sum(isinstance(one, CausalWorldModelCallback) for top in callbacks for one in _flatten(top))
         if n_own > 1:
@@ -506,35 +548,68 @@ class CausalGDP(OfflineToOnlineAlgorithm):
             losses = self._gradient_steps(gradient_steps, batch_size)
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
         if losses:
-            # One transfer from the device for all of them
-            means = th.stack([th.stack(values).mean() for values in losses.values()]).tolist()
-            for name, mean in zip(losses, means, strict=True):
-                self.logger.record(f"train/{name}", mean)
+            self._log_losses(losses)
 
-    def _gradient_steps(self, gradient_steps: int, batch_size: int) -> dict[str, list[th.Tensor]]:
-        losses: dict[str, list[th.Tensor]] = {}
+    def _log_losses(self, losses: list[tuple[list[str], th.Tensor]]) -> None:
+        names = [name for step_names, _ in losses for name in step_names]
+        # One transfer from the device for all of them
+        values = th.cat([step_values for _, step_values in losses]).tolist()
+        by_name: dict[str, list[float]] = {name: [] for name in names}
+        for name, value in zip(names, values, strict=True):
+            by_name[name].append(value)
+        for name, of_steps in by_name.items():
+            self.logger.record(f"train/{name}", sum(of_steps) / len(of_steps))
+
+    def _gradient_steps(self, gradient_steps: int, batch_size: int) -> list[tuple[list[str], th.Tensor]]:
+        """The losses of each step, their names and their values."""
+        losses: list[tuple[list[str], th.Tensor]] = []
         guided = self.policy.is_guided  # once, because a GPU has to be waited for
+        if self._update_graphs is not None:
+            self._update_graphs.update_learning_rates()
         for replay_data in self._batches(gradient_steps, batch_size):
             self._n_updates += 1
             trains_world_model = self._n_updates % self.world_model_delay == 0
             trains_actor = self._n_updates % self.policy_delay == 0
-            one_step = replay_data
+            batches = [replay_data]
             if isinstance(self.replay_buffer, NStepReplayBuffer) and (trains_world_model or trains_actor):
-                one_step = self._sample(batch_size, one_step=True)
-            if self.compile:
-                # What a CUDA graph returned is overwritten from here on
-                th.compiler.cudagraph_mark_step_begin()
-            next_actions, step_losses = self._update_critics(replay_data)
-            if trains_world_model:
-                step_losses.update(self._update_world_model(one_step))
-            if trains_actor:
-                if one_step is not replay_data:
-                    with th.no_grad():
-                        next_actions = self.actor_target.sample(self.actor_target.features(one_step.next_observations))
-                step_losses.update(self._update_actor(one_step, next_actions, guided))
-            self._update_targets()
-            for name, loss in step_losses.items():
-                losses.setdefault(name, []).append(loss.clone())
+                batches.append(self._sample(batch_size, one_step=True))
+            climbed = int(np.random.randint(len(self.critic.q_networks))) if trains_actor else 0
+            plan = StepPlan(trains_world_model, trains_actor, guided, climbed)
+            step_losses = self._run_gradient_step(plan, batches)
+            # A copy, because the next step may overwrite them
+            losses.append((list(step_losses), th.stack(list(step_losses.values()))))
+        return losses
+
+    def _run_gradient_step(self, plan: StepPlan, batches: list[Any]) -> dict[str, th.Tensor]:
+        if self._update_graphs is None:
+            return self._gradient_step(plan, *batches)
+        # All numbers of this object that a step depends on and that may change while it trains
+        numbers = (self._running_weight(), self.eta, self.denoising_weight, self.tau, self.gamma, len(batches[0].rewards))
+        return self._update_graphs.run((plan, numbers), partial(self._gradient_step, plan), batches)
+
+    def _gradient_step(self, plan: StepPlan, replay_data: Any, one_step: Any = None) -> dict[str, th.Tensor]:
+        """
+        :param plan: What is updated
+        :param replay_data: Batch of the critics, and of the others unless they have their own
+        :param one_step: Batch of the world model and the actor where returns are of several steps
+        :return: Losses by name
+        """
+        if self.compile:
+            # What a CUDA graph returned is overwritten from here on
+            th.compiler.cudagraph_mark_step_begin()
+        # The critics and the world model know nothing of each other
+        beside_critics = nullcontext() if self._update_graphs is None else self._update_graphs.branch()
+        next_actions, losses = self._update_critics(replay_data)
+        transitions = replay_data if one_step is None else one_step
+        if plan.trains_world_model:
+            with beside_critics:
+                losses.update(self._update_world_model(transitions))
+        if plan.trains_actor:
+            if one_step is not None:
+                with th.no_grad():
+                    next_actions = self.actor_target.sample(self.actor_target.features(one_step.next_observations))
+            losses.update(self._update_actor(transitions, next_actions, plan))
+        self._update_targets()
         return losses
 
     def _n_threads(self) -> int | None:
@@ -632,9 +707,8 @@ class CausalGDP(OfflineToOnlineAlgorithm):
         transition, reward = world_model_loss(self.world_model, state, action, next_state, rewards, weight, self.sample_masks)
         return transition.detach(), reward.detach(), gradients_of(self.world_model, transition + reward)
 
-    def _update_actor(self, transitions, next_actions: th.Tensor, guided: bool) -> dict[str, th.Tensor]:
-        climbed = int(np.random.randint(len(self.critic.q_networks)))
-        denoising, q_term, loss, gradients = self._actor_gradients(transitions, next_actions, climbed, guided)
+    def _update_actor(self, transitions, next_actions: th.Tensor, plan: StepPlan) -> dict[str, th.Tensor]:
+        denoising, q_term, loss, gradients = self._actor_gradients(transitions, next_actions, plan.climbed, plan.guided)
         self._step(self.actor, gradients)
         return {"actor_loss": loss, "denoising_loss": denoising, "q_loss": q_term}
 
@@ -670,7 +744,7 @@ class CausalGDP(OfflineToOnlineAlgorithm):
         return denoising, q_loss(values, scale)
 
     def _step(self, module: th.nn.Module, gradients: Gradients) -> None:
-        parameters = list(module.parameters())
+        parameters = self._parameters[module]
         for parameter, gradient in zip(parameters, gradients, strict=True):
             parameter.grad = gradient
         if self.max_grad_norm is not None and module is not self.world_model:
@@ -683,8 +757,8 @@ class CausalGDP(OfflineToOnlineAlgorithm):
     @th.no_grad()
     def _update_targets(self) -> None:
         # All parameters in one call, as SB3's polyak_update does one by one
-        online = (*self.critic.parameters(), *self.actor.parameters())
-        targets = (*self.critic_target.parameters(), *self.actor_target.parameters())
+        online = self._parameters[self.critic] + self._parameters[self.actor]
+        targets = self._parameters[self.critic_target] + self._parameters[self.actor_target]
         th._foreach_lerp_(targets, online, self.tau)
         # Copy running stats, see SB3's GH issue #996
         polyak_update(self.critic_batch_norm_stats, self.critic_batch_norm_stats_target, 1.0)
@@ -751,6 +825,11 @@ class CausalGDP(OfflineToOnlineAlgorithm):
                 f"{np.atleast_1d(values)[tuple(where)]}. Nothing of this step was stored; see VecCheckNan to find its origin."
             )
 
+    def set_parameters(self, load_path_or_dict, exact_match: bool = True, device: th.device | str = "auto") -> None:
+        super().set_parameters(load_path_or_dict, exact_match, device)
+        # Optimizers have other tensors now
+        self._setup_cuda_graphs()
+
     def save(
         self,
         path: str | pathlib.Path | io.BufferedIOBase,
@@ -781,10 +860,12 @@ class CausalGDP(OfflineToOnlineAlgorithm):
             "critic",
             "critic_target",
             "world_model",
+            "_parameters",
             *COMPILED,
             "discovery",
             "_fed_offline_position",
             "_device_replays",
+            "_update_graphs",
             "causal_graph_history",
             "actor_batch_norm_stats",
             "critic_batch_norm_stats",

@@ -2,6 +2,7 @@
 
 import inspect
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from functools import cache, wraps
 from typing import Any
 
@@ -25,7 +26,14 @@ def gradients_of(module: th.nn.Module, loss: th.Tensor) -> Gradients:
     parameters = list(module.parameters())
     trained = [parameter for parameter in parameters if parameter.requires_grad]
     gradients = iter(th.autograd.grad(loss, trained, allow_unused=True))
-    return tuple(next(gradients) if parameter.requires_grad else None for parameter in parameters)
+    return tuple(_laid_out_as(parameter, next(gradients)) if parameter.requires_grad else None for parameter in parameters)
+
+
+def _laid_out_as(parameter: th.Tensor, gradient: th.Tensor | None) -> th.Tensor | None:
+    # Fused optimizers on a GPU refuse other strides, which backward() mends and grad() does not
+    if gradient is None or not parameter.is_cuda or gradient.stride() == parameter.stride():
+        return gradient
+    return th.empty_like(parameter, requires_grad=False).copy_(gradient)
 
 
 def compiled(function: Callable[..., Any], mode: bool | str, device: th.device) -> Callable[..., Any]:
@@ -37,7 +45,7 @@ def compiled(function: Callable[..., Any], mode: bool | str, device: th.device) 
     """
 
     @cache
-    def graph() -> Callable[..., Any]:
+    def graph() -> tuple[Callable[..., Any], AbstractContextManager[None]]:
         options: dict[str, Any] = th._inductor.list_mode_options(mode) if isinstance(mode, str) else {}
         # On a CPU the calls between the kernels are compiled, too: a twentieth of an update
         options |= {"fallback_random": True, "cpp_wrapper": device.type == "cpu"}
@@ -46,14 +54,17 @@ def compiled(function: Callable[..., Any], mode: bool | str, device: th.device) 
             from sb3_causalgdp.product_pass import OneDnnProducts
 
             options |= {"post_grad_custom_post_pass": OneDnnProducts()}
-        return th.compile(  # type: ignore[call-overload]  # the type stubs lack two arguments
+        run = th.compile(  # type: ignore[call-overload]  # the type stubs lack two arguments
             function, options=options, isolate_recompiles=True, recompile_limit=_MOST_GRAPHS
         )
+        # One for all calls: to make one takes longer than to enter it
+        return run, th._dynamo.config.patch(trace_autograd_ops=True)
 
     @wraps(function)
     def call(*args: Any) -> Any:
-        with th._dynamo.config.patch(trace_autograd_ops=True):
-            return graph()(*args)
+        run, tracing_gradients = graph()
+        with tracing_gradients:
+            return run(*args)
 
     return call
 

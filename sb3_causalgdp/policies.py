@@ -581,8 +581,9 @@ class CausalGDPPolicy(BasePolicy):
         acting = self._numpy_acting(observation)
         if acting is not None:
             assert isinstance(observation, th.Tensor)
-            noise = self._candidate_noise(len(observation), deterministic).numpy()
-            return th.as_tensor(acting(self, observation.float().flatten(1).numpy(), noise, self.is_guided))
+            noise = self._candidate_noise(len(observation), deterministic).cpu().numpy()
+            actions = acting(self, observation.float().flatten(1).cpu().numpy(), noise, self.is_guided)
+            return th.as_tensor(actions, device=observation.device)
         features = self.actor.features(observation)
         return self._act_in_torch(observation, features, self._candidate_noise(len(features), deterministic))
 

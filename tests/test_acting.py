@@ -54,8 +54,12 @@ def both_paths(policy, observations, deterministic=False):
         return fast, policy._act_in_torch(observations, policy.actor.features(observations), noise)
 
 
-def states(n_rows, seed=0):
-    return np.random.default_rng(seed).normal(size=(n_rows, N_STATES)).astype(np.float32)
+DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.skipif(not th.cuda.is_available(), reason="needs a GPU"))]
+
+
+def states(n_rows, seed=0, device="cpu"):
+    rows = np.random.default_rng(seed).normal(size=(n_rows, N_STATES)).astype(np.float32)
+    return rows if device == "cpu" else th.as_tensor(rows, device=device)
 
 
 @pytest.mark.parametrize("noise_schedule", ["vp", "linear", "cosine"])
@@ -119,6 +123,25 @@ def test_training_is_seen_at_once():
     assert policy._acting is acting
     assert not th.allclose(before, after)
     th.testing.assert_close(after, plain, rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_a_copy_of_the_weights_acts_alike_and_sees_training_at_once(device):
+    policy = make_policy().to(device)
+    policy._acting = acting = NumpyActing(policy, copies=True)
+    before, plain = both_paths(policy, states(2, device=device))
+    th.testing.assert_close(before, plain, rtol=1e-4, atol=1e-5)
+    with th.no_grad():
+        for parameter in policy.parameters():
+            parameter.mul_(1.1)
+        policy.return_std.mul_(2.0), policy.world_model.state_mean.add_(0.5)
+    after, plain = both_paths(policy, states(2, device=device))
+    assert policy._acting is acting and after.device.type == device
+    assert not th.allclose(before, after)
+    th.testing.assert_close(after, plain, rtol=1e-4, atol=1e-5)
+    # The copy is no part of the policy, and shares none of its memory
+    assert all(parameter.grad is None for parameter in acting._copy.policy.parameters())
+    assert not {id(one) for one in policy.parameters()} & {id(one) for one in acting._copy.policy.parameters()}
 
 
 @pytest.mark.parametrize("change", ["copied", "pickled", "replaced", "moved"])

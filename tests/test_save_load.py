@@ -240,6 +240,7 @@ ARGUMENTS = {
     "tensorboard_log": "somewhere",
     "policy_kwargs": {"net_arch": [8], "activation_fn": "tanh", "world_model_net_arch": [8], "critic_layer_norm": True},
     "compile": True,
+    "cuda_graph": False,
     "torch_threads": 2,
     "verbose": 0,
     "seed": 11,

@@ -1,6 +1,6 @@
 """
-Updates per second of CausalGDP on a GPU, plain, compiled and as CUDA graphs, beside what its matrix products and its kernel
-launches need at the least. Wall-clock time, because the work is not the processor's.
+Updates per second of CausalGDP on a GPU, plain, compiled and recorded as CUDA graphs, beside what its matrix products and its
+kernel launches need at the least. Wall-clock time, because the work is not the processor's.
 
     python -m benchmarks.speed.gpu
 """
@@ -23,22 +23,43 @@ from benchmarks.speed.data import collect, save
 from benchmarks.speed.results import markdown
 from benchmarks.speed.workers.causalgdp import CausalGDPContestant
 from benchmarks.speed.workers.matmuls import count_flops
+from sb3_causalgdp.cuda_graphs import record
 
-MODES: dict[str, bool | str] = {"plain": False, "compile": True, "reduce-overhead": "reduce-overhead"}
-COLUMNS = ("contestant", "mode", "updates/s", "one at a time", "ms", "ms of products", "ms of launches", "deviation")
-CHECKED_UPDATES = 2
+MODES: dict[str, dict[str, Any]] = {
+    "plain": {"cuda_graph": False},
+    "compile": {"compile": True, "cuda_graph": False},
+    "reduce-overhead": {"compile": "reduce-overhead"},
+    "cuda_graph": {},
+    "compile, cuda_graph": {"compile": True},
+}
+COLUMNS = (
+    "contestant",
+    "mode",
+    "updates/s",
+    "one at a time",
+    "ms",
+    "ms of products",
+    "ms of launches",
+    "recorded",
+    "deviation",
+)
+STEP_COLUMNS = ("contestant", "mode", "steps/s")
+WARM_UPS = 24
+STARTS = 1_000
+CHECKED_UPDATES = 4
 
 
-def make(setting: contestants.Contestant, transitions: str, device: str, mode: str) -> CausalGDPContestant:
+def make(setting: contestants.Contestant, transitions: str, device: str, mode: str, **config: Any) -> CausalGDPContestant:
     """
     :param setting: One of CausalGDP's
     :param transitions: Path of what it learns from
     :param device: PyTorch's name of the device
     :param mode: One of ``MODES``
-    :return: The contestant in this process, its replay buffer filled and its graph known
+    :param config: More of the contestant's configuration
+    :return: The contestant in this process; without an environment, its replay buffer is filled and its graph known
     """
-    kwargs = {**setting.config["kwargs"], "device": device, "compile": MODES[mode]}
-    return CausalGDPContestant({"batch_size": 256, "transitions": transitions, "kwargs": kwargs})
+    kwargs = {**setting.config["kwargs"], "device": device, **MODES[mode]}
+    return CausalGDPContestant({"batch_size": 256, "transitions": transitions, "kwargs": kwargs, **config})
 
 
 def seconds(function: Callable[[], Any], device: str) -> float:
@@ -55,16 +76,34 @@ def seconds(function: Callable[[], Any], device: str) -> float:
     return time.perf_counter() - start
 
 
-def changes(contestant: CausalGDPContestant) -> th.Tensor:
+def states_of(contestant: CausalGDPContestant) -> list[th.Tensor]:
     """
-    :param contestant: Before its first update
-    :return: What the first updates change in all parameters, for the same seed
+    :param contestant: After its first update
+    :return: All that an update writes: parameters, running averages and states of optimizers
     """
-    parameters = list(contestant.model.policy.parameters())
-    before = th.nn.utils.parameters_to_vector(parameters).detach().clone()
-    th.manual_seed(1), np.random.seed(1)
-    contestant.update(CHECKED_UPDATES)
-    return (th.nn.utils.parameters_to_vector(parameters).detach() - before).cpu()
+    model = contestant.model
+    optimizers = (model.actor.optimizer, model.critic.optimizer, model.world_model.optimizer)
+    states = [state for optimizer in optimizers for state in optimizer.state.values()]
+    return [*model.policy.state_dict().values(), *(value for state in states for value in state.values())]
+
+
+def deviations(ours: dict[str, CausalGDPContestant]) -> dict[str, float]:
+    """
+    :param ours: A contestant for each mode, before its first update, the plain one first
+    :return: By how much a few updates from one state change the parameters otherwise than the plain ones, relative to these
+    """
+    changes: dict[str, th.Tensor] = {}
+    start: list[th.Tensor] = []
+    for mode, one in ours.items():
+        one.model._n_updates = 100  # recordings begin behind the first hundred
+        one.update(WARM_UPS)
+        start = start or [state.clone() for state in states_of(one)]
+        th._foreach_copy_(states_of(one), start)
+        th.manual_seed(1), np.random.seed(1)
+        before = th.nn.utils.parameters_to_vector(one.model.policy.parameters()).detach().clone()
+        one.update(CHECKED_UPDATES)
+        changes[mode] = th.nn.utils.parameters_to_vector(one.model.policy.parameters()).detach() - before
+    return {mode: float((change - changes["plain"]).norm() / changes["plain"].norm()) for mode, change in changes.items()}
 
 
 def floors(contestant: CausalGDPContestant, device: str) -> dict[str, float]:
@@ -72,17 +111,26 @@ def floors(contestant: CausalGDPContestant, device: str) -> dict[str, float]:
     :param contestant: With the plain update
     :param device: PyTorch's name of the device
     :return: Milliseconds of an update's floating point operations at the rate of a hidden layer, and of its operations at the
-        rate at which the device takes tiny ones
+        rate at which the device takes tiny ones, launched one by one and recorded
     """
     x, weight, tiny = th.randn(256, 256, device=device), th.randn(256, 256, device=device), th.zeros(1, device=device)
     result, repeats = th.empty_like(x), 1_000
     product = seconds(lambda: [th.mm(x, weight, out=result) for _ in range(repeats)], device) / repeats
     launch = seconds(lambda: [tiny.add_(1.0) for _ in range(repeats)], device) / repeats
+    recorded = launch
+    if device.startswith("cuda"):
+        replay = record(lambda: {str(index): tiny.add_(1.0) for index in range(repeats)})
+        replay()
+        recorded = seconds(replay, device) / repeats
     flops = count_flops(lambda: contestant.update(2))["total"] / 2
     with th.profiler.profile() as profiler:
         contestant.update(2)
-    launches = sum(event.count for event in profiler.key_averages() if event.key == "cudaLaunchKernel") / 2
-    return {"ms of products": 1e3 * flops / (2 * 256**3) * product, "ms of launches": 1e3 * launches * launch}
+    launches = sum(event.count for event in profiler.key_averages() if event.key.startswith("cudaLaunchKernel")) / 2
+    return {
+        "ms of products": 1e3 * flops / (2 * 256**3) * product,
+        "ms of launches": 1e3 * launches * launch,
+        "recorded": 1e3 * launches * recorded,
+    }
 
 
 def measure(
@@ -92,13 +140,13 @@ def measure(
     :param setting: One of CausalGDP's
     :param transitions: Path of what it learns from
     :param device: PyTorch's name of the device
-    :param modes: Of ``MODES``; they take turns
+    :param modes: Of ``MODES``, the plain one first; they take turns
     :param updates: Of one turn
     :param rounds: Turns of each
-    :return: A row for each mode; ``deviation`` is how far its first updates are from the plain ones, relative to these
+    :return: A row for each mode
     """
     ours = {mode: make(setting, transitions, device, mode) for mode in modes}
-    changed = {mode: changes(one) for mode, one in ours.items()}
+    deviation = deviations(ours)
     taken: dict[str, list[tuple[float, float]]] = {mode: [] for mode in modes}
     for round_ in range(rounds + 1):
         for mode, one in ours.items():
@@ -106,14 +154,31 @@ def measure(
             single = seconds(lambda one=one: [one.update(1) for _ in range(updates)], device)  # type: ignore[misc]
             if round_ > 0:  # the first one compiles
                 taken[mode].append((at_once / updates, single / updates))
-    plain = floors(ours["plain"], device) if "plain" in ours else {}
+    floor = floors(ours["plain"], device)
     rows = []
     for mode, values in taken.items():
         at_once, single = np.median(values, axis=0)
         row = {"contestant": setting.name, "mode": mode, "updates/s": 1.0 / at_once, "one at a time": 1.0 / single}
-        if "plain" in changed:
-            row["deviation"] = float((changed[mode] - changed["plain"]).norm() / changed["plain"].norm())
-        rows.append({**row, "ms": 1e3 * at_once, **plain})
+        rows.append({**row, "deviation": deviation[mode], "ms": 1e3 * at_once, **floor})
+    return rows
+
+
+def environment_steps(transitions: str, device: str, mode: str, steps: int) -> list[dict[str, Any]]:
+    """
+    :param transitions: A path, of which nothing is used
+    :param device: PyTorch's name of the device
+    :param mode: One of ``MODES``
+    :param steps: Environment steps that are measured
+    :return: A row for one environment and one for 16, with one gradient step for each environment step in both
+    """
+    rows = []
+    for n_envs in (1, 16):
+        setting = contestants.causalgdp(contestants.DEFAULT, gradient_steps=-1, learning_starts=STARTS)
+        one = make(setting, transitions, device, mode, env=HALF_CHEETAH, n_envs=n_envs)
+        one.learn(2 * STARTS)  # the first graph is known, and everything is compiled
+        taken: list[int] = []
+        wall_clock = seconds(lambda one=one, taken=taken: taken.append(one.learn(steps)["steps"]), device)  # type: ignore[misc]
+        rows.append({"contestant": f"{setting.name}, {n_envs} environments", "mode": mode, "steps/s": taken[0] / wall_clock})
     return rows
 
 
@@ -125,23 +190,29 @@ def main(argv: Sequence[str] | None = None) -> None:
     """
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--device", default="cuda")
-    parser.add_argument("--modes", nargs="+", choices=MODES, default=list(MODES))
+    parser.add_argument("--modes", nargs="+", choices=MODES, default=list(MODES), help="beside the plain one")
     parser.add_argument("--updates", type=int, default=200, help="of one turn (%(default)s)")
     parser.add_argument("--rounds", type=int, default=5, help="turns of each mode (%(default)s)")
     parser.add_argument("--rows", type=int, default=ROWS[HALF_CHEETAH], help="transitions in the buffer (%(default)s)")
+    parser.add_argument("--steps", type=int, default=3_000, help="environment steps of learn(), 0 for none (%(default)s)")
     parser.add_argument("--output", type=Path, help="JSON file for the rows")
     args = parser.parse_args(argv)
     if args.device.startswith("cuda") and not th.cuda.is_available():
         parser.error("PyTorch finds no GPU here; --device cpu measures what there is")
+    modes = ["plain", *(mode for mode in args.modes if mode != "plain")]
     with tempfile.TemporaryDirectory() as scratch:
         transitions = save(Path(scratch) / "transitions.npz", collect(HALF_CHEETAH, args.rows))
         rows = []
         for setting in contestants.main_settings():
-            rows += measure(setting, transitions, args.device, args.modes, args.updates, args.rounds)
+            rows += measure(setting, transitions, args.device, modes, args.updates, args.rounds)
+        learn: list[dict[str, Any]] = []
+        for mode in modes if args.steps > 0 else []:
+            learn += environment_steps(transitions, args.device, mode, args.steps)
     name = th.cuda.get_device_name() if args.device.startswith("cuda") else "CPU"
-    print(f"{date.today()}, {name}, PyTorch {th.__version__}, {HALF_CHEETAH} sizes, batch 256\n{markdown(rows, COLUMNS)}")
+    print(f"{date.today()}, {name}, PyTorch {th.__version__}, {HALF_CHEETAH} sizes, batch 256")
+    print(markdown(rows, COLUMNS), markdown(learn, STEP_COLUMNS), sep="\n")
     if args.output is not None:
-        args.output.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
+        args.output.write_text(json.dumps({"updates": rows, "learn": learn}, indent=1) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -83,8 +83,9 @@ class GuidanceRule:
         :param reference: Tensor whose device and type the result takes
         :return: lambda_k, shape ``(1, 1)`` or ``(batch, 1)``
         """
-        scales = th.as_tensor(self.scales, dtype=reference.dtype, device=reference.device)
-        return (scales if len(scales) == 1 else scales[step]).reshape(-1, 1)
+        # Made on the device: to copy them there would be to wait for it
+        scales = [th.full((1,), scale, dtype=reference.dtype, device=reference.device) for scale in self.scales]
+        return (scales[0] if len(scales) == 1 else th.cat(scales)[step]).reshape(-1, 1)
 
     def __call__(
         self,
