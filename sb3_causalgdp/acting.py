@@ -8,7 +8,7 @@ covered is left to the plain path, see :meth:`NumpyActing.covers`.
 """
 
 import copy
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import reduce
 from itertools import pairwise
 from typing import Any, NamedTuple
@@ -101,15 +101,16 @@ def _layer(linear: nn.Linear) -> Layer:
     return _view(linear.weight), _view(linear.bias)[:, None]
 
 
-def _linear_layers(modules: Any, activation: type[nn.Module]) -> list[Layer] | None:
-    """The layers, with that activation between them; None if there is anything else."""
-    layers = []
-    for module in modules:
-        if isinstance(module, nn.Linear) and module.bias is not None:
-            layers.append(_layer(module))
-        elif type(module) not in (activation, fast(activation)):
-            return None
-    return layers
+def _linear_layers(modules: Iterable[nn.Module]) -> list[Layer]:
+    return [_layer(module) for module in modules if isinstance(module, nn.Linear)]
+
+
+def _has_plain_layers(modules: Iterable[nn.Module], activation: type[nn.Module]) -> bool:
+    """Whether there is nothing but layers with a bias and that activation."""
+    return all(
+        (isinstance(module, nn.Linear) and module.bias is not None) or type(module) in (activation, fast(activation))
+        for module in modules
+    )
 
 
 class _LayerNorm:
@@ -195,10 +196,7 @@ class _Denoiser:
         self.action_weight, self.condition_weight = weight[:, :first_time], weight[:, first_condition:]
         self.time_weight = weight[:, first_time:first_condition]
         self.time_table = _view(denoiser.time_table).T
-        time_layers = _linear_layers(denoiser.time_mlp, nn.Mish)
-        layers = _linear_layers(denoiser.network, actor.activation_fn)
-        assert time_layers is not None and layers is not None
-        self.time_layers, self.layers = time_layers, layers
+        self.time_layers, self.layers = _linear_layers(denoiser.time_mlp), _linear_layers(denoiser.network)
         self.activation = ACTIVATIONS[actor.activation_fn].value
         eta = 1.0 if actor.sampler == "ddpm" else actor.ddim_eta
         n_steps = actor.schedule.n_steps
@@ -273,9 +271,7 @@ class _Critic:
 
     def __init__(self, network: nn.Sequential, activation_fn: type[nn.Module]) -> None:
         modules, norms = _without_norms(network)
-        layers = _linear_layers(modules, activation_fn)
-        assert layers is not None
-        self.layers = layers
+        self.layers = layers = _linear_layers(modules)
         self.norms: Sequence[_LayerNorm | None] = [_LayerNorm(norm) for norm in norms] or [None] * (len(layers) - 1)
         self.activation = ACTIVATIONS[activation_fn]
 
@@ -542,7 +538,7 @@ class NumpyActing:
             and type(policy.critic_target.features_extractor) is FlattenExtractor
             and type(policy.actor.denoiser) is MLPDenoiser
             and activation in ACTIVATIONS
-            and all(_linear_layers(network, activation) is not None for network in networks)
+            and all(_has_plain_layers(network, activation) for network in networks)
             and all(parameter.dtype == th.float32 for parameter in policy.parameters())
             and (rule is None or not rule.needs_jacobian)
         )

@@ -3,6 +3,7 @@
 from collections import Counter
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
+from functools import partial
 from typing import Any
 
 import torch as th
@@ -13,14 +14,15 @@ Batches = Sequence[Any]
 Recorder = Callable[[Callable[[], Losses]], Callable[[], Losses]]
 
 
-def record(function: Callable[[], Losses]) -> Callable[[], Losses]:
+def record(function: Callable[[], Losses], stream: th.cuda.Stream) -> Callable[[], Losses]:
     """
     :param function: Launches kernels on the GPU, on tensors that stay where they are, and does not wait for them
+    :param stream: Where they are launched while recording
     :return: Launches all of them at once, and returns the tensors that the function returned, with what they hold then
     """
     graph = th.cuda.CUDAGraph()
     # An error only where this thread does what cannot be recorded: others may use the GPU meanwhile
-    with th.cuda.graph(graph, capture_error_mode="thread_local"):
+    with th.cuda.graph(graph, stream=stream, capture_error_mode="thread_local"):
         losses = function()
 
     def replay() -> Losses:
@@ -30,13 +32,23 @@ def record(function: Callable[[], Losses]) -> Callable[[], Losses]:
     return replay
 
 
+@contextmanager
+def _branch(stream: th.cuda.Stream, start: th.cuda.Event) -> Iterator[None]:
+    """Launch on that stream, behind the event; what comes afterwards on the current one waits for it."""
+    current = th.cuda.current_stream(stream.device)
+    stream.wait_event(start)
+    with th.cuda.stream(stream):
+        yield
+    current.wait_stream(stream)
+
+
 class UpdateGraphs:
     """
     Runs gradient steps, and from the fourth step of a kind on replays a recording of it. All that a recording reads is in
     tensors which stay in place: parameters, optimizer states, masks, and copies of the batch and of the learning rates.
 
     :param optimizers: Those that the steps use; they know steps that stay on the GPU (``capturable`` or ``fused``)
-    :param recorder: Makes a recording
+    :param recorder: Makes a recording, by default a CUDA graph
     """
 
     # Steps that create optimizer states, compile, and choose kernels
@@ -44,10 +56,16 @@ class UpdateGraphs:
     # Each holds the memory of a gradient step; more only where something that is recorded changes all the time
     MOST_RECORDINGS = 32
 
-    def __init__(self, optimizers: Sequence[th.optim.Optimizer], recorder: Recorder = record) -> None:
-        self._recorder = recorder
+    def __init__(self, optimizers: Sequence[th.optim.Optimizer], recorder: Recorder | None = None) -> None:
         device = optimizers[0].param_groups[0]["params"][0].device
-        self._side = th.cuda.Stream(device) if device.type == "cuda" else None
+        self._streams: tuple[th.cuda.Stream, th.cuda.Stream] | None = None
+        if device.type == "cuda":
+            # Warm-ups too: PyTorch remembers where a parameter was first used, and cannot record on its default stream
+            self._streams = th.cuda.Stream(device), th.cuda.Stream(device)
+        if recorder is None:
+            assert self._streams is not None
+            recorder = partial(record, stream=self._streams[0])
+        self._recorder = recorder
         self._n_runs: Counter[Hashable] = Counter()
         self._recordings: dict[Hashable, tuple[list[th.Tensor], Callable[[], Losses]]] = {}
         groups = [group for optimizer in optimizers for group in optimizer.param_groups]
@@ -64,7 +82,8 @@ class UpdateGraphs:
         if kind not in self._recordings:
             self._n_runs[kind] += 1
             if self._n_runs[kind] <= self.WARM_UPS:
-                return step(*batches)
+                with self._own_stream(0):
+                    return step(*batches)
             self._record(kind, step, batches)
         inputs, replay = self._recordings[kind]
         th._foreach_copy_(inputs, list(tensors_of(batches)))
@@ -87,14 +106,18 @@ class UpdateGraphs:
                 f"change (a features extractor or optimizer of your own?): {error}. cuda_graph=False works with it."
             ) from error
 
+    def _own_stream(self, index: int) -> AbstractContextManager[None]:
+        if self._streams is None:
+            return nullcontext()
+        stream = self._streams[index]
+        return _branch(stream, th.cuda.current_stream(stream.device).record_event())
+
     def branch(self) -> AbstractContextManager[None]:
         """
         :return: What is launched in this context runs, on a GPU, beside all that was launched between this call and it; what
             is launched afterwards waits for both
         """
-        if self._side is None:
-            return nullcontext()
-        return _branch(self._side, th.cuda.current_stream(self._side.device).record_event())
+        return self._own_stream(1)
 
     def update_learning_rates(self) -> None:
         """Let recordings use the learning rates that the optimizers have now."""
@@ -112,14 +135,6 @@ class UpdateGraphs:
         finally:
             for group, rate, capturable in before:
                 group.update(lr=rate, capturable=capturable)
-
-
-@contextmanager
-def _branch(side: th.cuda.Stream, start: th.cuda.Event) -> Iterator[None]:
-    side.wait_event(start)
-    with th.cuda.stream(side):
-        yield
-    th.cuda.current_stream(side.device).wait_stream(side)
 
 
 def why_not_recorded(

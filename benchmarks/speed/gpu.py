@@ -119,7 +119,7 @@ def floors(contestant: CausalGDPContestant, device: str) -> dict[str, float]:
     launch = seconds(lambda: [tiny.add_(1.0) for _ in range(repeats)], device) / repeats
     recorded = launch
     if device.startswith("cuda"):
-        replay = record(lambda: {str(index): tiny.add_(1.0) for index in range(repeats)})
+        replay = record(lambda: {str(index): tiny.add_(1.0) for index in range(repeats)}, th.cuda.Stream(device))
         replay()
         recorded = seconds(replay, device) / repeats
     flops = count_flops(lambda: contestant.update(2))["total"] / 2
@@ -190,7 +190,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     """
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--device", default="cuda")
-    parser.add_argument("--modes", nargs="+", choices=MODES, default=list(MODES), help="beside the plain one")
+    parser.add_argument("--modes", nargs="+", choices=MODES, default=list(MODES), help="of updates beside the plain ones")
     parser.add_argument("--updates", type=int, default=200, help="of one turn (%(default)s)")
     parser.add_argument("--rounds", type=int, default=5, help="turns of each mode (%(default)s)")
     parser.add_argument("--rows", type=int, default=ROWS[HALF_CHEETAH], help="transitions in the buffer (%(default)s)")
@@ -205,12 +205,13 @@ def main(argv: Sequence[str] | None = None) -> None:
         rows = []
         for setting in contestants.main_settings():
             rows += measure(setting, transitions, args.device, modes, args.updates, args.rounds)
+        name = th.cuda.get_device_name() if args.device.startswith("cuda") else "CPU"
+        print(f"{date.today()}, {name}, PyTorch {th.__version__}, {HALF_CHEETAH} sizes, batch 256")
+        print(markdown(rows, COLUMNS), flush=True)
         learn: list[dict[str, Any]] = []
-        for mode in modes if args.steps > 0 else []:
+        for mode in args.modes if args.steps > 0 else []:
             learn += environment_steps(transitions, args.device, mode, args.steps)
-    name = th.cuda.get_device_name() if args.device.startswith("cuda") else "CPU"
-    print(f"{date.today()}, {name}, PyTorch {th.__version__}, {HALF_CHEETAH} sizes, batch 256")
-    print(markdown(rows, COLUMNS), markdown(learn, STEP_COLUMNS), sep="\n")
+        print(markdown(learn, STEP_COLUMNS))
     if args.output is not None:
         args.output.write_text(json.dumps({"updates": rows, "learn": learn}, indent=1) + "\n", encoding="utf-8")
 
