@@ -13,14 +13,14 @@ LAYERS = [
     {"__init__"},
     {"causalgdp"},
     {"callbacks"},
-    {"losses", "gradients", "diagnostics", "structural", "device_replay"},
+    {"losses", "gradients", "diagnostics", "structural", "device_replay", "cuda_graphs"},
     {"product_pass"},
     {"policies"},
     {"acting"},
     {"causal", "offline", "diffusion"},
     {"checks", "products", "activations"},
 ]
-WITHOUT_SB3 = {"causal", "diffusion", "losses", "gradients", "products", "product_pass", "activations"}
+WITHOUT_SB3 = {"causal", "diffusion", "losses", "gradients", "products", "product_pass", "activations", "cuda_graphs"}
 LEVELS = {part: level for level, parts in enumerate(LAYERS) for part in parts}
 FILES = sorted(PACKAGE.rglob("*.py"))
 

@@ -106,30 +106,43 @@ def deviations(ours: dict[str, CausalGDPContestant]) -> dict[str, float]:
     return {mode: float((change - changes["plain"]).norm() / changes["plain"].norm()) for mode, change in changes.items()}
 
 
+def per_launch(launch: Callable[[], Any], device: str, recorded: bool) -> float:
+    """
+    :param launch: One operation
+    :param device: PyTorch's name of the device
+    :param recorded: Whether a thousand of them are a CUDA graph, on a GPU
+    :return: Wall-clock seconds of one
+    """
+    repeats = 1_000
+
+    def launch_all() -> dict[str, th.Tensor]:
+        for _ in range(repeats):
+            launch()
+        return {}
+
+    function = record(launch_all, th.cuda.Stream(device)) if recorded and device.startswith("cuda") else launch_all
+    function()
+    return seconds(function, device) / repeats
+
+
 def floors(contestant: CausalGDPContestant, device: str) -> dict[str, float]:
     """
     :param contestant: With the plain update
     :param device: PyTorch's name of the device
-    :return: Milliseconds of an update's floating point operations at the rate of a hidden layer, and of its operations at the
-        rate at which the device takes tiny ones, launched one by one and recorded
+    :return: Milliseconds of an update's floating point operations at the rate of a hidden layer's products, recorded, and of
+        its operations at the rate at which the device takes tiny ones, launched one by one and recorded
     """
     x, weight, tiny = th.randn(256, 256, device=device), th.randn(256, 256, device=device), th.zeros(1, device=device)
-    result, repeats = th.empty_like(x), 1_000
-    product = seconds(lambda: [th.mm(x, weight, out=result) for _ in range(repeats)], device) / repeats
-    launch = seconds(lambda: [tiny.add_(1.0) for _ in range(repeats)], device) / repeats
-    recorded = launch
-    if device.startswith("cuda"):
-        replay = record(lambda: {str(index): tiny.add_(1.0) for index in range(repeats)}, th.cuda.Stream(device))
-        replay()
-        recorded = seconds(replay, device) / repeats
+    result = th.empty_like(x)
+    product = per_launch(lambda: th.mm(x, weight, out=result), device, recorded=True)
     flops = count_flops(lambda: contestant.update(2))["total"] / 2
     with th.profiler.profile() as profiler:
         contestant.update(2)
     launches = sum(event.count for event in profiler.key_averages() if event.key.startswith("cudaLaunchKernel")) / 2
     return {
         "ms of products": 1e3 * flops / (2 * 256**3) * product,
-        "ms of launches": 1e3 * launches * launch,
-        "recorded": 1e3 * launches * recorded,
+        "ms of launches": 1e3 * launches * per_launch(lambda: tiny.add_(1.0), device, recorded=False),
+        "recorded": 1e3 * launches * per_launch(lambda: tiny.add_(1.0), device, recorded=True),
     }
 
 
