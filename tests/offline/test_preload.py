@@ -1,5 +1,8 @@
 import builtins
+import json
+import shutil
 import warnings
+from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
@@ -18,6 +21,8 @@ from sb3_causalgdp.offline.sources import MinariSource
 minari = pytest.importorskip("minari")
 pytest.importorskip("h5py")
 from minari.data_collector import EpisodeBuffer  # noqa: E402
+from minari.storage import remotes  # noqa: E402
+from minari.storage.remotes.cloud_storage import CloudStorage  # noqa: E402
 
 KWARGS = {
     "learning_starts": 5,
@@ -372,6 +377,53 @@ def test_a_file_that_is_cut_off(dataset, tmp_path):
 def test_a_broken_pickle(tmp_path):
     (tmp_path / "buffer.pkl").write_bytes(b"nothing")
     refuses(make(), tmp_path / "buffer.pkl", "cannot be read as a replay buffer")
+
+
+class FolderStorage(CloudStorage):
+    """A remote store of Minari's that is a folder on this machine."""
+
+    def __init__(self, name, token=None):
+        self.folder = Path(name)
+
+    def list_datasets(self, prefix=None):
+        files = self.folder.rglob("data/metadata.json")
+        names = [file.parents[1].relative_to(self.folder).as_posix() for file in files]
+        return [name for name in names if name.startswith(prefix or "")]
+
+    def get_dataset_metadata(self, dataset_id):
+        return json.loads((self.folder / dataset_id / "data" / "metadata.json").read_text())
+
+    def download_dataset(self, dataset_id, path):
+        shutil.copytree(self.folder / dataset_id, Path(path) / dataset_id)
+
+    def list_namespaces(self):
+        return [file.parent.relative_to(self.folder).as_posix() for file in self.folder.rglob("namespace_metadata.json")]
+
+    def download_namespace_metadata(self, namespace, path):
+        (Path(path) / namespace).mkdir(parents=True, exist_ok=True)
+        shutil.copy(self.folder / namespace / "namespace_metadata.json", Path(path) / namespace)
+
+    def upload_dataset(self, dataset_id):
+        raise NotImplementedError
+
+    def upload_namespace(self, namespace):
+        raise NotImplementedError
+
+
+def test_a_dataset_that_is_missing_is_downloaded_once(dataset, tmp_path, monkeypatch):
+    expected = make().preload(dataset).offline_buffer
+    monkeypatch.setitem(remotes._registry, "folder", lambda: FolderStorage)
+    monkeypatch.setenv("MINARI_REMOTE", f"folder://{tmp_path}")
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "here"))
+    with pytest.raises(FileNotFoundError, match="is not on this machine"):
+        make().preload(dataset, download=False)
+    found = make().preload(dataset).offline_buffer
+    monkeypatch.setattr(FolderStorage, "download_dataset", lambda *args: pytest.fail("downloaded again"))
+    again = make().preload(dataset).offline_buffer
+    for buffer in (found, again):
+        assert buffer.size() == expected.size() > 0
+        np.testing.assert_array_equal(buffer.observations, expected.observations)
+        np.testing.assert_array_equal(buffer.rewards, expected.rewards)
 
 
 def test_a_dataset_that_is_nowhere(tmp_path, monkeypatch):
