@@ -36,7 +36,7 @@ def test_updates_can_be_asked_for_one_at_a_time(config):
 
 
 def test_the_parts_of_an_update_make_up_all_of_it(config):
-    profile = CausalGDPContestant(config).profile(2)
+    profile = CausalGDPContestant(config).profile(20)
     assert sum(profile["parts"].values()) == pytest.approx(profile["wrapped"], rel=0.05)
     assert {"critics", "TD target", "optimizers", "sample"} <= set(profile["parts"])
 
