@@ -141,10 +141,9 @@ class CausalGDP(OfflineToOnlineAlgorithm):
     :param tensorboard_log: The log location for tensorboard (if None, no logging)
     :param policy_kwargs: Additional arguments to be passed to the policy on creation, see
         :class:`~sb3_causalgdp.policies.CausalGDPPolicy`
-    :param compile: Whether to compile with ``torch.compile``, or its ``mode``, such as ``"reduce-overhead"`` for CUDA graphs:
-        one graph for the loss and the gradients of each network, with the world model and the guidance in it. The first
-        updates then take a minute or two; the numbers are the same up to rounding. Saved models do not depend on it. Needs
-        PyTorch 2.13 and, on a CPU, a C++ compiler
+    :param compile: Whether to compile with ``torch.compile``, or its ``mode``: one graph for the loss and the gradients of each
+        network, with the world model and the guidance in it. The first updates then take a minute or two; the numbers are the
+        same up to rounding. Saved models do not depend on it. Needs PyTorch 2.13 and, on a CPU, a C++ compiler
     :param cuda_graph: Whether gradient steps behind the first hundred are recorded as CUDA graphs and replayed, with
         ``compile`` or without: on a GPU the launches of their kernels, and not their work, are what takes time. The numbers
         are those of the plain steps. ``"auto"`` is True on a GPU, unless the replay buffer is the memory efficient one, an
@@ -583,9 +582,11 @@ class CausalGDP(OfflineToOnlineAlgorithm):
     def _run_gradient_step(self, plan: StepPlan, batches: list[Any]) -> dict[str, th.Tensor]:
         if self._update_graphs is None:
             return self._gradient_step(plan, *batches)
-        # All numbers of this object that a step depends on and that may change while it trains
-        numbers = (self._running_weight(), self.eta, self.denoising_weight, self.tau, self.gamma, len(batches[0].rewards))
-        return self._update_graphs.run((plan, numbers), partial(self._gradient_step, plan), batches)
+        # All that a step depends on and that may change while it trains
+        weights = (self._running_weight(), self.eta, self.denoising_weight, self.tau, self.gamma, self.max_grad_norm)
+        scales = (self.policy.state_guidance_scale, self.policy.outcome_guidance_scale)
+        kind = (plan, weights, scales, len(batches[0].rewards))
+        return self._update_graphs.run(kind, partial(self._gradient_step, plan), batches)
 
     def _gradient_step(self, plan: StepPlan, replay_data: Any, one_step: Any = None) -> dict[str, th.Tensor]:
         """
