@@ -141,9 +141,9 @@ class CausalGDP(OfflineToOnlineAlgorithm):
     :param tensorboard_log: The log location for tensorboard (if None, no logging)
     :param policy_kwargs: Additional arguments to be passed to the policy on creation, see
         :class:`~sb3_causalgdp.policies.CausalGDPPolicy`
-    :param compile: Whether to compile with ``torch.compile``, or its ``mode``: one graph for the loss and the gradients of each
-        network, with the world model and the guidance in it. The first updates then take a minute or two; the numbers are the
-        same up to rounding. Saved models do not depend on it. Needs PyTorch 2.13 and, on a CPU, a C++ compiler
+    :param compile: Whether to compile with ``torch.compile``, or its ``mode``: one graph for the loss and the gradients of
+        each network, with the world model and the guidance in it. The first updates then take a minute or two; the numbers
+        are the same up to rounding. Saved models do not depend on it. Needs PyTorch 2.13 and, on a CPU, a C++ compiler
     :param cuda_graph: Whether gradient steps behind the first hundred are recorded as CUDA graphs and replayed, with
         ``compile`` or without: on a GPU the launches of their kernels, and not their work, are what takes time. The numbers
         are those of the plain steps. ``"auto"`` is True on a GPU, unless the replay buffer is the memory efficient one, an
