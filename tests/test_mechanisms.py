@@ -7,6 +7,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 
 from sb3_causalgdp import CausalGDP, CausalWorldModelCallback
+from sb3_causalgdp.causalgdp import StepPlan
 
 KWARGS = {
     "learning_starts": 50,
@@ -107,7 +108,8 @@ def test_guidance_enters_the_actors_loss(trained, monkeypatch):
         th.manual_seed(0)
         with th.random.fork_rng(), monkeypatch.context() as patch:
             patch.setattr(model, "_step", lambda module, gradients: None)
-            return float(model._update_actor(data, data.actions, model.policy.is_guided)["denoising_loss"])
+            plan = StepPlan(True, True, model.policy.is_guided, climbed=0)
+            return float(model._update_actor(data, data.actions, plan)["denoising_loss"])
 
     guided = denoising()
     assert denoising() == guided
@@ -323,6 +325,7 @@ def test_a_gradient_step_trains_actor_critics_and_world_model_and_the_actors_los
             if any(not th.equal(old, new) for old, new in zip(before[name], module.parameters(), strict=True))
         }
 
-    assert changed_by(lambda: model._update_actor(data, data.actions, model.policy.is_guided)) == {"actor"}
+    plan = StepPlan(True, True, model.policy.is_guided, climbed=0)
+    assert changed_by(lambda: model._update_actor(data, data.actions, plan)) == {"actor"}
     assert changed_by(lambda: model._update_critics(data)) == {"critic"}
     assert changed_by(lambda: model._update_world_model(data)) == {"world_model"}
