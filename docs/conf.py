@@ -54,7 +54,8 @@ autodoc_mock_imports = [name for name in ("rl_zoo3", "optuna", "sb3_contrib") if
 
 # Every reference to a name of ours must lead somewhere; other packages' documentation is not at hand without a network
 nitpicky = True
-OTHERS = "torch numpy np npt gymnasium stable_baselines3 minari collections contextlib pathlib os io matplotlib pandas pd networkx nx"
+LIBRARIES = "torch numpy np npt gymnasium stable_baselines3 minari matplotlib pandas pd networkx nx"
+OTHERS = f"{LIBRARIES} collections contextlib pathlib os io"
 nitpick_ignore_regex = [(r"py:.*", rf"{name}(\..*)?") for name in OTHERS.split()]
 # Hints in quotation marks, for packages that are imported late
 nitpick_ignore_regex += [(r"py:class", name) for name in ("Figure", "Groups", "VecEnv")]

@@ -37,7 +37,7 @@ from sb3_causalgdp.checks import check_at_least_zero, is_count
 from sb3_causalgdp.cuda_graphs import UpdateGraphs, why_not_recorded
 from sb3_causalgdp.device_replay import DeviceReplay
 from sb3_causalgdp.gradients import Gradients, check_compile, compiled, gradients_of
-from sb3_causalgdp.losses import critic_loss, denoising_loss, q_loss, td_target, world_model_loss
+from sb3_causalgdp.losses import critic_loss, denoising_loss, q_loss, quantile, td_target, world_model_loss
 from sb3_causalgdp.offline.algorithm import OfflineToOnlineAlgorithm, callback_list
 from sb3_causalgdp.offline.replay import concatenate_samples, split_sample
 from sb3_causalgdp.policies import CausalGDPPolicy, CnnPolicy, DiffusionActor, MlpPolicy, MultiInputPolicy, q_values
@@ -146,8 +146,8 @@ class CausalGDP(OfflineToOnlineAlgorithm):
         are the same up to rounding. Saved models do not depend on it. Needs PyTorch 2.13 and, on a CPU, a C++ compiler
     :param cuda_graph: Whether gradient steps behind the first hundred are recorded as CUDA graphs and replayed, with
         ``compile`` or without: on a GPU the launches of their kernels, and not their work, are what takes time. The numbers
-        are those of the plain steps. ``"auto"`` is True on a GPU, unless the replay buffer is the memory efficient one, an
-        optimizer cannot be recorded, or ``compile`` makes CUDA graphs itself
+        are those of the plain steps. ``"auto"`` is True on a GPU, unless an optimizer cannot be recorded or ``compile`` makes
+        CUDA graphs itself
     :param torch_threads: PyTorch's number of CPU threads during updates; None leaves it as it is. ``"auto"`` is 1 where
         observations are vectors, whose networks are so small that threads only wait for each other, and otherwise None
     :param verbose: Verbosity level: 0 for no output, 1 for info messages (such as device or wrappers used), 2 for debug
@@ -347,7 +347,7 @@ class CausalGDP(OfflineToOnlineAlgorithm):
         return [_optimizer_of(module) for module in (self.actor, self.critic, self.world_model)]
 
     def _why_not_recorded(self) -> str | None:
-        return why_not_recorded(self.device, self.compile, self.optimize_memory_usage, self._optimizers())
+        return why_not_recorded(self.device, self.compile, self._optimizers())
 
     def _check_cuda_graph(self) -> None:
         reason = self._why_not_recorded() if self.cuda_graph is True else None
@@ -692,20 +692,18 @@ class CausalGDP(OfflineToOnlineAlgorithm):
         next_state = self.policy.causal_state(transitions.next_observations)
         rewards = transitions.rewards.flatten()
         with th.no_grad():
-            quantile = th.quantile(rewards, self.REWARD_QUANTILE)
-            self.policy.reward_target.lerp_(quantile, self._running_weight())
+            self.policy.reward_target.lerp_(quantile(rewards, self.REWARD_QUANTILE), self._running_weight())
         # The memory efficient buffer does not keep the last observation of an episode
-        weight = 1.0 - transitions.dones.flatten() if self.optimize_memory_usage else None
-        known = slice(None) if weight is None else weight > 0.0
-        self.world_model.update_statistics(state[known], next_state[known], rewards[known])
-        transition, reward, gradients = self._world_model_gradients(state, transitions.actions, next_state, rewards, weight)
+        known = 1.0 - transitions.dones.flatten() if self.optimize_memory_usage else None
+        transition, reward, gradients = self._world_model_gradients(state, transitions.actions, next_state, rewards, known)
         self._step(self.world_model, gradients)
         return {"world_model_transition_loss": transition, "world_model_reward_loss": reward}
 
     def _world_model_gradients(
-        self, state: th.Tensor, action: th.Tensor, next_state: th.Tensor, rewards: th.Tensor, weight: th.Tensor | None
+        self, state: th.Tensor, action: th.Tensor, next_state: th.Tensor, rewards: th.Tensor, known: th.Tensor | None
     ) -> tuple[th.Tensor, th.Tensor, Gradients]:
-        transition, reward = world_model_loss(self.world_model, state, action, next_state, rewards, weight, self.sample_masks)
+        self.world_model.update_statistics(state, next_state, rewards, known)
+        transition, reward = world_model_loss(self.world_model, state, action, next_state, rewards, known, self.sample_masks)
         return transition.detach(), reward.detach(), gradients_of(self.world_model, transition + reward)
 
     def _update_actor(self, transitions, next_actions: th.Tensor, plan: StepPlan) -> dict[str, th.Tensor]:

@@ -137,13 +137,10 @@ class UpdateGraphs:
                 group.update(lr=rate, capturable=capturable)
 
 
-def why_not_recorded(
-    device: th.device, compile_mode: bool | str, optimize_memory_usage: bool, optimizers: Sequence[th.optim.Optimizer]
-) -> str | None:
+def why_not_recorded(device: th.device, compile_mode: bool | str, optimizers: Sequence[th.optim.Optimizer]) -> str | None:
     """
     :param device: Where the networks are
     :param compile_mode: False, True or a mode of ``torch.compile``
-    :param optimize_memory_usage: Whether the replay buffer is the memory efficient one
     :param optimizers: Those of the networks
     :return: Why gradient steps cannot be recorded as CUDA graphs, and what to do; None if they can
     """
@@ -151,11 +148,6 @@ def why_not_recorded(
         return f"cuda_graph=True needs device='cuda', and this model is on {str(device)!r}: use cuda_graph='auto'"
     if isinstance(compile_mode, str) and th._inductor.list_mode_options(compile_mode).get("triton.cudagraphs", False):
         return f"compile={compile_mode!r} makes CUDA graphs of its own, which cuda_graph=True cannot record: use compile=True"
-    if optimize_memory_usage:
-        return (
-            "cuda_graph=True needs batches of one size, and with optimize_memory_usage=True the world model leaves out the "
-            "last transitions of episodes: use one of the two"
-        )
     for optimizer in optimizers:
         if not all(group.get("capturable") or group.get("fused") for group in optimizer.param_groups):
             return (

@@ -34,6 +34,7 @@ SETTINGS = {
     "clipped": {"max_grad_norm": 0.1},
     "max_q_backup": {"max_q_backup": True},
     "n steps": {"n_steps": 3},
+    "memory": {"optimize_memory_usage": True, "replay_buffer_kwargs": {"handle_timeout_termination": False}},
     "every step": {"policy_delay": 1, "world_model_delay": 3},
     "AdamW": {"policy_kwargs": {"net_arch": [8], "optimizer_class": th.optim.AdamW}},
 }
@@ -183,12 +184,11 @@ def optimizer(kind, **kwargs):
         ({"optimizers": [optimizer(th.optim.RMSprop, capturable=True)]}, None),
         ({"device": th.device("cpu")}, "needs device='cuda'"),
         ({"compile_mode": "reduce-overhead"}, "makes CUDA graphs of its own"),
-        ({"optimize_memory_usage": True}, "needs batches of one size"),
         ({"optimizers": [optimizer(th.optim.Adam, fused=True), optimizer(th.optim.SGD)]}, "SGD has neither"),
     ],
 )
 def test_what_stands_in_the_way_is_said(changed, reason):
-    arguments = {"device": th.device("cuda"), "compile_mode": False, "optimize_memory_usage": False}
+    arguments = {"device": th.device("cuda"), "compile_mode": False}
     found = why_not_recorded(**{**arguments, "optimizers": [optimizer(th.optim.Adam, fused=True)], **changed})
     assert found is None if reason is None else reason in found
 

@@ -5,7 +5,7 @@ import torch as th
 
 from sb3_causalgdp.causal import MaskedWorldModel
 from sb3_causalgdp.diffusion import GuidanceRule, NoiseSchedule
-from sb3_causalgdp.losses import critic_loss, denoising_loss, q_loss, td_target, world_model_loss
+from sb3_causalgdp.losses import critic_loss, denoising_loss, q_loss, quantile, td_target, world_model_loss
 
 SCHEDULE = NoiseSchedule("vp", 5)
 
@@ -185,3 +185,10 @@ def test_weights_of_zero_leave_transitions_out(transitions):
 def test_weights_of_zero_alone_give_no_loss(transitions):
     model, *data = transitions
     assert [loss.item() for loss in world_model_loss(model, *data, weight=th.zeros(10))] == [0.0, 0.0]
+
+
+@pytest.mark.parametrize("n_values", [1, 2, 3, 32, 256])
+@pytest.mark.parametrize("share", [0.0, 0.5, 0.99, 1.0])
+def test_a_quantile_is_that_of_pytorch(n_values, share):
+    values = th.randn(n_values, generator=th.Generator().manual_seed(n_values))
+    th.testing.assert_close(quantile(values, share), th.quantile(values, share))

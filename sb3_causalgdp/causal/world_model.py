@@ -119,6 +119,13 @@ def _through_tanh(gradient: th.Tensor, output: th.Tensor) -> th.Tensor:
     return th.ops.aten.tanh_backward(gradient, output)
 
 
+def _mean(values: th.Tensor, known: th.Tensor | None) -> th.Tensor:
+    """Over the batch, of the rows that are known."""
+    if known is None:
+        return values.mean(dim=0)
+    return known @ values / known.sum().clamp(min=1.0)
+
+
 def _drawn(mask: th.Tensor) -> th.Tensor:
     # Exact at 0 and 1: a uniform number is below 1 and not below 0
     return (th.rand_like(mask) < mask).to(mask.dtype)
@@ -266,28 +273,34 @@ class MaskedWorldModel(nn.Module):
             getattr(self, name).copy_(mask)
 
     @th.no_grad()
-    def update_statistics(self, state: th.Tensor, next_state: th.Tensor, reward: th.Tensor) -> None:
+    def update_statistics(
+        self, state: th.Tensor, next_state: th.Tensor, reward: th.Tensor, known: th.Tensor | None = None
+    ) -> None:
         """
         Move the running means and variances towards those of a batch.
 
         :param state: Shape ``(batch, n)``
         :param next_state: Shape ``(batch, n)``
         :param reward: Shape ``(batch,)``
+        :param known: 1 for the transitions that count and 0 for the others, shape ``(batch,)``; None if all count
         """
         if len(state) < 2:
             return
-        self.n_batches += 1.0
-        weight = th.clamp(1.0 / self.n_batches, min=1.0 / self.STATISTICS_WINDOW)
+        # Nothing is told by fewer than two transitions
+        counts = 1.0 if known is None else (known.sum() >= 2.0).float()
+        self.n_batches += counts
+        weight = counts * th.clamp(1.0 / self.n_batches.clamp(min=1.0), min=1.0 / self.STATISTICS_WINDOW)
         for values, mean, variance in (
             (state, self.state_mean, self.state_variance),
             (reward, self.reward_mean, self.reward_variance),
         ):
-            difference = values.mean(dim=0) - mean
-            spread = values.var(dim=0, correction=0)
+            batch_mean = _mean(values, known)
+            difference = batch_mean - mean
+            spread = _mean((values - batch_mean).square(), known)
             variance.lerp_(spread + (1.0 - weight) * difference.square(), weight)
-            mean.lerp_(mean + difference, weight)
+            mean.lerp_(batch_mean, weight)
         # About 0, not about its mean: the residual path leaves the mean change to the network
-        self.change_variance.lerp_((next_state - state).square().mean(dim=0), weight)
+        self.change_variance.lerp_(_mean((next_state - state).square(), known), weight)
 
     @property
     def state_std(self) -> th.Tensor:

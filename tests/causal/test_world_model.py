@@ -282,6 +282,22 @@ def test_statistics_ignore_a_single_row_and_forget_the_start_values():
     assert th.equal(model.state_mean, th.full((2,), 9.0)) and model.reward_mean == 3.0
 
 
+def test_statistics_of_the_transitions_that_are_known_are_those_of_a_batch_without_the_others():
+    th.manual_seed(0)
+    state, next_state, reward = th.randn(8, 2), th.randn(8, 2), th.randn(8)
+    known = th.tensor([1.0, 0.0, 1.0, 1.0, 0.0, 1.0, 1.0, 1.0])
+    kept = known > 0.0
+    both = MaskedWorldModel(2, 1, [8]), MaskedWorldModel(2, 1, [8])
+    for scale in (1.0, 3.0):
+        both[0].update_statistics(scale * state, next_state, reward, known)
+        both[1].update_statistics(scale * state[kept], next_state[kept], reward[kept])
+    # One transition or none tells nothing
+    for few in (th.zeros(8), (th.arange(8) == 0).float()):
+        both[0].update_statistics(state, next_state, reward, few)
+    for name, value in both[0].named_buffers():
+        th.testing.assert_close(value, dict(both[1].named_buffers())[name], msg=name)
+
+
 def test_statistics_follow_a_change_of_the_data():
     model = MaskedWorldModel(1, 1, [8])
     model.STATISTICS_WINDOW = 20
