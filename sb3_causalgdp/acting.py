@@ -444,6 +444,10 @@ def _unit(rows: np.ndarray) -> np.ndarray:
     return rows / np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-8)
 
 
+def _networks_of(policy: Policy) -> tuple[nn.Module, ...]:
+    return policy.actor.denoiser, policy.critic_target, policy.world_model
+
+
 class HostCopy:
     """
     A policy's networks in the processor's own memory.
@@ -469,8 +473,7 @@ class HostCopy:
         :param policy: A policy
         :return: All that acting reads of it
         """
-        modules = policy.actor.denoiser, policy.critic_target, policy.world_model
-        tensors = [tensor for module in modules for tensor in (*module.parameters(), *module.buffers())]
+        tensors = [tensor for module in _networks_of(policy) for tensor in (*module.parameters(), *module.buffers())]
         return [*tensors, policy.return_std, policy.reward_target]
 
     @th.no_grad()
@@ -500,13 +503,9 @@ class NumpyActing:
         rule = policy.guidance_rule
         self.rule = None if rule is None else _Rule(rule, policy.actor.schedule, policy.actor.action_dim)
         self._blas = ThreadpoolController().select(user_api="blas")
-        self._modules = self._modules_of(policy)
+        self._modules = _networks_of(policy)
         self._tensors = HostCopy.tensors_of(policy)
         self._addresses = list(map(th.Tensor.data_ptr, self._tensors))
-
-    @staticmethod
-    def _modules_of(policy: Policy) -> tuple[nn.Module, ...]:
-        return policy.actor.denoiser, policy.critic_target, policy.world_model
 
     def __reduce__(self) -> tuple[type, tuple]:
         # Views are of one process and one policy: copies and pickles of the policy make their own
@@ -517,7 +516,7 @@ class NumpyActing:
         :param policy: The policy
         :return: Whether the views are still those of its networks, which may have been moved or replaced
         """
-        same = all(ours is theirs for ours, theirs in zip(self._modules, self._modules_of(policy), strict=True))
+        same = all(ours is theirs for ours, theirs in zip(self._modules, _networks_of(policy), strict=True))
         return same and list(map(th.Tensor.data_ptr, self._tensors)) == self._addresses
 
     @staticmethod

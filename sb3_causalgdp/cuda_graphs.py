@@ -8,6 +8,8 @@ from typing import Any
 
 import torch as th
 
+from sb3_causalgdp.offline.replay import leaves_of, map_leaves
+
 Losses = dict[str, th.Tensor]
 Batches = Sequence[Any]
 """Samples of SB3's replay buffers."""
@@ -164,14 +166,9 @@ def tensors_of(samples: Batches) -> Iterator[th.Tensor]:
     """
     for sample in samples:
         for part in sample:
-            if isinstance(part, dict):
-                yield from part.values()
-            elif part is not None:
-                yield part
+            if part is not None:
+                yield from leaves_of(part)
 
 
 def _copy(sample: Any) -> Any:
-    def copy(part: Any) -> Any:
-        return {key: values.clone() for key, values in part.items()} if isinstance(part, dict) else part.clone()
-
-    return type(sample)(*(None if part is None else copy(part) for part in sample))
+    return type(sample)(*(None if part is None else map_leaves(th.clone, part) for part in sample))

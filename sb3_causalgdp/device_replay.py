@@ -1,12 +1,14 @@
 """Sampling from a copy of a replay buffer that lies where the networks are."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 import torch as th
 from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
 from stable_baselines3.common.type_aliases import DictReplayBufferSamples, ReplayBufferSamples
+
+from sb3_causalgdp.offline.replay import leaves_of, map_leaves
 
 Columns = dict[str, Any]
 """By name: ``(positions, n_envs, ...)``, or a dictionary of those."""
@@ -27,7 +29,7 @@ class DeviceReplay:
     def __init__(self, buffer: ReplayBuffer, device: th.device) -> None:
         self.buffer = buffer
         self.device = device
-        self.columns: Columns = {name: _map(self._empty_like, values) for name, values in _columns(buffer).items()}
+        self.columns: Columns = {name: map_leaves(self._empty_like, values) for name, values in _columns(buffer).items()}
         self._copied = 0  # position up to which rows were copied
         self._was_full = False
         self._newest: list[np.ndarray] | None = None
@@ -70,7 +72,7 @@ class DeviceReplay:
         :param envs: Of which environment, shape ``(batch,)``
         :return: These transitions
         """
-        drawn = {name: _map(lambda values: values[positions, envs], values) for name, values in self.columns.items()}
+        drawn = {name: map_leaves(lambda values: values[positions, envs], values) for name, values in self.columns.items()}
         # Only dones that are not due to timeouts, see SB3's ReplayBuffer
         drawn["dones"] = (drawn["dones"] * (1.0 - drawn.pop("timeouts"))).unsqueeze(1)
         drawn["rewards"] = drawn["rewards"].unsqueeze(1)
@@ -104,7 +106,7 @@ class DeviceReplay:
         if first == end:
             return
         for name, column in _columns(self.buffer).items():
-            for there, here in zip(_leaves(self.columns[name]), _leaves(column), strict=True):
+            for there, here in zip(leaves_of(self.columns[name]), leaves_of(column), strict=True):
                 there[first:end].copy_(th.from_numpy(here[first:end]))
 
     def _empty_like(self, values: np.ndarray) -> th.Tensor:
@@ -118,17 +120,9 @@ def _columns(buffer: ReplayBuffer) -> Columns:
 
 def _arrays(buffer: ReplayBuffer) -> Iterator[np.ndarray]:
     for column in _columns(buffer).values():
-        yield from _leaves(column)
+        yield from leaves_of(column)
 
 
 def _dtype_of(values: np.ndarray) -> th.dtype:
     dtype = th.from_numpy(values[:0]).dtype
     return th.float32 if dtype is th.float64 else dtype
-
-
-def _map(function: Callable[[Any], Any], column: Any) -> Any:
-    return {key: function(values) for key, values in column.items()} if isinstance(column, dict) else function(column)
-
-
-def _leaves(column: Any) -> Iterator[Any]:
-    yield from column.values() if isinstance(column, dict) else (column,)

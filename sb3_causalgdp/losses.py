@@ -114,7 +114,7 @@ def world_model_loss(
 
 def quantile(values: th.Tensor, share: float) -> th.Tensor:
     """
-    As ``torch.quantile``, with linear interpolation, for high quantiles: in a tenth of its time, because it does not sort all
+    As ``torch.quantile``, with linear interpolation, for high quantiles: in a third of its time, because it does not sort all
     values.
 
     :param values: Shape ``(batch,)``

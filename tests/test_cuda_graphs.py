@@ -5,7 +5,6 @@ made: like a CUDA graph it knows tensors alone, so that a number that was looked
 
 import copy
 
-import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
@@ -16,25 +15,13 @@ from torch.fx.experimental.proxy_tensor import make_fx
 
 from sb3_causalgdp import CausalGDP
 from sb3_causalgdp.cuda_graphs import UpdateGraphs, why_not_recorded
-from tests.test_update import trained_model
+from tests.test_update import COMPILABLE, assert_same_weights, dictionary_pendulum, trained_model
 
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.skipif(not th.cuda.is_available(), reason="needs a GPU"))]
 SETTINGS = {
-    "defaults": {},
-    "chain": {"actor_update": "chain"},
-    "mish": {"policy_kwargs": {"net_arch": [8], "activation_fn": "mish"}},
-    "no guidance": {"guidance": None},
+    **COMPILABLE,
     "score, by step": {"guidance": "score", "guidance_scale": [0.1, 0.2, 0.3, 0.4, 0.5]},
-    "normalized, reward": {"guidance": "normalized", "guidance_target": "reward"},
-    "tweedie": {"guidance_covariance": "tweedie"},
-    "isotropic": {"guidance_covariance": "isotropic"},
-    "ddim": {"sampler": "ddim"},
     "three critics": {"policy_kwargs": {"net_arch": [8], "n_critics": 3}},
-    "layer norm": {"policy_kwargs": {"net_arch": [8], "critic_layer_norm": True}},
-    "clipped": {"max_grad_norm": 0.1},
-    "max_q_backup": {"max_q_backup": True},
-    "n steps": {"n_steps": 3},
-    "memory": {"optimize_memory_usage": True, "replay_buffer_kwargs": {"handle_timeout_termination": False}},
     "every step": {"policy_delay": 1, "world_model_delay": 3},
     "AdamW": {"policy_kwargs": {"net_arch": [8], "optimizer_class": th.optim.AdamW}},
 }
@@ -42,10 +29,8 @@ SETTINGS = {
 
 def states_of(model):
     """Every tensor that a gradient step writes."""
-    yield from model.policy.state_dict().values()
-    for optimizer in model._optimizers():
-        for state in optimizer.state.values():
-            yield from state.values()
+    states = [state for optimizer in model._optimizers() for state in optimizer.state.values()]
+    return [*model.policy.state_dict().values(), *(value for state in states for value in state.values())]
 
 
 def recorder_of(model):
@@ -54,7 +39,7 @@ def recorder_of(model):
         return None
 
     def record_operations(function):
-        states = list(states_of(model))
+        states = states_of(model)
         before, random_state = [state.clone() for state in states], th.get_rng_state()
         names = []
 
@@ -104,8 +89,7 @@ def test_recorded_steps_train_as_plain_ones(name, device, tmp_path):
     expected, logged = train(plain), train(recorded)
     # One for each critic that is climbed and each pair of networks that are updated together
     assert len(recorded._update_graphs._recordings) >= 2
-    for name, value in plain.policy.state_dict().items():
-        th.testing.assert_close(recorded.policy.state_dict()[name], value, rtol=1e-4, atol=1e-5, msg=name)
+    assert_same_weights(recorded.policy.state_dict(), plain.policy.state_dict(), rtol=1e-4, atol=1e-5)
     for ours, theirs in zip(logged, expected, strict=True):
         assert ours == pytest.approx(theirs, rel=1e-3, abs=1e-5)
     assert all(group["lr"] == pytest.approx(1e-3 / 14) for group in recorded.actor.optimizer.param_groups)
@@ -113,9 +97,7 @@ def test_recorded_steps_train_as_plain_ones(name, device, tmp_path):
 
 @pytest.mark.parametrize("device", DEVICES)
 def test_recorded_steps_train_on_dictionaries_and_see_new_masks_and_weights(device, tmp_path):
-    space = gym.spaces.Dict({"pole": gym.spaces.Box(-1.0, 1.0, (2,)), "speed": gym.spaces.Box(-8.0, 8.0, (1,))})
-    env = gym.wrappers.TransformObservation(gym.make("Pendulum-v1"), lambda x: {"pole": x[:2], "speed": x[2:]}, space)
-    both = copies(trained_model("MultiInputPolicy", env, device=device), tmp_path)
+    both = copies(trained_model("MultiInputPolicy", dictionary_pendulum(), device=device), tmp_path)
     for model in both:
         train(model)
         closed = copy.deepcopy(model.causal_graph())
@@ -123,20 +105,19 @@ def test_recorded_steps_train_on_dictionaries_and_see_new_masks_and_weights(devi
         model.set_causal_graph(closed)
         model.eta *= 10.0
         train(model)
-    for name, value in both[0].policy.state_dict().items():
-        th.testing.assert_close(both[1].policy.state_dict()[name], value, rtol=1e-4, atol=1e-5, msg=name)
+    assert_same_weights(both[1].policy.state_dict(), both[0].policy.state_dict(), rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.parametrize("device", DEVICES)
 def test_recorded_steps_train_on_images(device, tmp_path):
     env = FakeImageEnv(screen_height=36, screen_width=36, n_channels=1, discrete=False)
+    env.observation_space.seed(0)
     policy_kwargs = {"net_arch": [8], "features_extractor_kwargs": {"features_dim": 8}}
     both = copies(trained_model("CnnPolicy", env, device=device, policy_kwargs=policy_kwargs), tmp_path)
     for model in both:
         train(model)
     assert len(both[1]._update_graphs._recordings) >= 2
-    for name, value in both[0].policy.state_dict().items():
-        th.testing.assert_close(both[1].policy.state_dict()[name], value, rtol=1e-3, atol=1e-4, msg=name)
+    assert_same_weights(both[1].policy.state_dict(), both[0].policy.state_dict(), rtol=1e-3, atol=1e-4)
 
 
 def test_recordings_that_keep_changing_do_not_pile_up():

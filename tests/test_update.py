@@ -32,6 +32,12 @@ def trained_model(policy="MlpPolicy", env="Pendulum-v1", **kwargs):
     return model
 
 
+def dictionary_pendulum():
+    """Pendulum, whose observations are a dictionary of vectors."""
+    space = gym.spaces.Dict({"pole": gym.spaces.Box(-1.0, 1.0, (2,)), "speed": gym.spaces.Box(-8.0, 8.0, (1,))})
+    return gym.wrappers.TransformObservation(gym.make("Pendulum-v1"), lambda x: {"pole": x[:2], "speed": x[2:]}, space)
+
+
 # The value that the guidance climbs ------------------------------------------------------------------------------------
 
 
@@ -211,6 +217,11 @@ def compile_for_tests(monkeypatch, **options):
     monkeypatch.setattr(th, "compile", compile_whole)
 
 
+def assert_same_weights(found, expected, **tolerances):
+    for name, value in expected.items():
+        th.testing.assert_close(found[name], value, msg=name, **tolerances)
+
+
 def assert_trains_alike(model, path, compile_=True):
     model.save(path / "model")
     model.save_replay_buffer(path / "buffer")
@@ -221,8 +232,7 @@ def assert_trains_alike(model, path, compile_=True):
         loaded.set_logger(Logger(None, []))
         assert loaded.policy.is_guided == model.policy.is_guided
         states.append(weights_after(loaded))
-    for name, value in states[0].items():
-        th.testing.assert_close(states[1][name], value, rtol=1e-5, atol=1e-6, msg=name)
+    assert_same_weights(states[1], states[0], rtol=1e-5, atol=1e-6)
     return loaded
 
 
@@ -247,9 +257,7 @@ COMPILABLE = {
 
 def test_an_update_on_a_dictionary_of_vectors_is_one_graph_for_each_network(tmp_path, monkeypatch):
     compile_for_tests(monkeypatch, backend="eager")
-    space = gym.spaces.Dict({"pole": gym.spaces.Box(-1.0, 1.0, (2,)), "speed": gym.spaces.Box(-8.0, 8.0, (1,))})
-    env = gym.wrappers.TransformObservation(gym.make("Pendulum-v1"), lambda x: {"pole": x[:2], "speed": x[2:]}, space)
-    assert_trains_alike(trained_model("MultiInputPolicy", env), tmp_path)
+    assert_trains_alike(trained_model("MultiInputPolicy", dictionary_pendulum()), tmp_path)
 
 
 @pytest.mark.parametrize("name", COMPILABLE)

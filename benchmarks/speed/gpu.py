@@ -23,6 +23,7 @@ from benchmarks.speed.data import collect, save
 from benchmarks.speed.results import markdown
 from benchmarks.speed.workers.causalgdp import CausalGDPContestant
 from benchmarks.speed.workers.matmuls import count_flops
+from sb3_causalgdp import CausalGDP
 from sb3_causalgdp.cuda_graphs import record
 
 MODES: dict[str, dict[str, Any]] = {
@@ -76,14 +77,12 @@ def seconds(function: Callable[[], Any], device: str) -> float:
     return time.perf_counter() - start
 
 
-def states_of(contestant: CausalGDPContestant) -> list[th.Tensor]:
+def states_of(model: CausalGDP) -> list[th.Tensor]:
     """
-    :param contestant: After its first update
+    :param model: After its first update
     :return: All that an update writes: parameters, running averages and states of optimizers
     """
-    model = contestant.model
-    optimizers = (model.actor.optimizer, model.critic.optimizer, model.world_model.optimizer)
-    states = [state for optimizer in optimizers for state in optimizer.state.values()]
+    states = [state for optimizer in model._optimizers() for state in optimizer.state.values()]
     return [*model.policy.state_dict().values(), *(value for state in states for value in state.values())]
 
 
@@ -97,8 +96,8 @@ def deviations(ours: dict[str, CausalGDPContestant]) -> dict[str, float]:
     for mode, one in ours.items():
         one.model._n_updates = 100  # recordings begin behind the first hundred
         one.update(WARM_UPS)
-        start = start or [state.clone() for state in states_of(one)]
-        th._foreach_copy_(states_of(one), start)
+        start = start or [state.clone() for state in states_of(one.model)]
+        th._foreach_copy_(states_of(one.model), start)
         th.manual_seed(1), np.random.seed(1)
         before = th.nn.utils.parameters_to_vector(one.model.policy.parameters()).detach().clone()
         one.update(CHECKED_UPDATES)

@@ -289,7 +289,7 @@ class MaskedWorldModel(nn.Module):
         # Nothing is told by fewer than two transitions
         counts = 1.0 if known is None else (known.sum() >= 2.0).float()
         self.n_batches += counts
-        weight = counts * th.clamp(1.0 / self.n_batches.clamp(min=1.0), min=1.0 / self.STATISTICS_WINDOW)
+        weight = counts / self.n_batches.clamp(1.0, self.STATISTICS_WINDOW)
         for values, mean, variance in (
             (state, self.state_mean, self.state_variance),
             (reward, self.reward_mean, self.reward_variance),

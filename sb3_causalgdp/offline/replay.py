@@ -1,6 +1,6 @@
 """Sampling from several replay buffers, and an environment that has spaces alone."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import torch as th
@@ -35,6 +35,23 @@ def _concatenate(parts: Sequence[Any]) -> Any:
     if isinstance(parts[0], dict):
         return {key: th.cat([part[key] for part in parts]) for key in parts[0]}
     return None if parts[0] is None else th.cat(list(parts))
+
+
+def map_leaves(function: Callable[[Any], Any], part: Any) -> Any:
+    """
+    :param function: What is done to each array or tensor
+    :param part: A part of a sample or a column of a buffer: one of these, or a dictionary of them
+    :return: The results, in the same form
+    """
+    return {key: function(values) for key, values in part.items()} if isinstance(part, dict) else function(part)
+
+
+def leaves_of(part: Any) -> Iterator[Any]:
+    """
+    :param part: As for :func:`map_leaves`
+    :return: Its arrays or tensors
+    """
+    yield from part.values() if isinstance(part, dict) else (part,)
 
 
 def split_sample(sample: Any, n_parts: int) -> list[Any]:
