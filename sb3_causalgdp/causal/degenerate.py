@@ -6,7 +6,7 @@ from datetime import datetime, timezone
 from typing import Any
 
 import numpy as np
-import torch as th
+from scipy.linalg import solve_triangular
 
 from sb3_causalgdp.causal.matrices import cholesky_in_place
 from sb3_causalgdp.causal.variables import TransitionVariables
@@ -66,7 +66,7 @@ def variance_inflation(correlation: np.ndarray, n_last: int) -> np.ndarray:
     return _inflation(_factor(correlation), n_last)
 
 
-def _factor(correlation: np.ndarray) -> th.Tensor:
+def _factor(correlation: np.ndarray) -> np.ndarray:
     """Lower Cholesky factor without pivoting, shape (p, p); its squared diagonal is what the variables before one leave."""
     matrix = correlation.copy()
     diagonal = np.einsum("ii->i", matrix)
@@ -75,24 +75,24 @@ def _factor(correlation: np.ndarray) -> th.Tensor:
     return cholesky_in_place(matrix)
 
 
-def _degeneracy(correlation: np.ndarray, factor: th.Tensor) -> Degeneracy:
+def _degeneracy(correlation: np.ndarray, factor: np.ndarray) -> Degeneracy:
     moving = np.flatnonzero(np.diagonal(correlation) > 0.0)
-    left = factor.diagonal().numpy()[moving] ** 2
+    left = factor.diagonal()[moving] ** 2
     sure, others = moving[left > SUSPICIOUS_SHARE], moving[left <= SUSPICIOUS_SHARE]
     if len(others) == 0:
         return Degeneracy(moving, (), {})
     of_others = correlation[others]
     of_sure = cholesky_in_place(correlation[sure][:, sure])
-    explained = th.linalg.solve_triangular(of_sure, th.from_numpy(of_others[:, sure]).T, upper=False)
-    pivots, factor = _pivots((th.from_numpy(of_others[:, others]) - explained.T @ explained).numpy())
+    explained = solve_triangular(of_sure, of_others[:, sure].T, lower=True)
+    pivots, factor = _pivots(of_others[:, others] - explained.T @ explained)
     kept, rest = np.concatenate([sure, others[pivots]]), np.setdiff1d(np.arange(len(others)), pivots)
     if len(rest) == 0:
         return Degeneracy(np.sort(kept), (), {})
     # What the kept ones say about each dependent one: back through both factors
-    of_pivots = th.linalg.solve_triangular(factor[:, pivots], factor[:, rest], upper=True)
-    of_rest = th.linalg.solve_triangular(of_sure.T, explained[:, rest] - explained[:, pivots] @ of_pivots, upper=True)
+    of_pivots = solve_triangular(factor[:, pivots], factor[:, rest])
+    of_rest = solve_triangular(of_sure, explained[:, rest] - explained[:, pivots] @ of_pivots, lower=True, trans="T")
     stand_in, members = {}, []
-    for variable, coefficients in zip(others[rest].tolist(), th.cat([of_rest, of_pivots]).T.numpy(), strict=True):
+    for variable, coefficients in zip(others[rest].tolist(), np.concatenate([of_rest, of_pivots]).T, strict=True):
         sizes = np.abs(coefficients)
         strongest = int(sizes.argmax())
         stand_in[variable] = int(kept[strongest]), float(np.sign(coefficients[strongest]))
@@ -100,7 +100,7 @@ def _degeneracy(correlation: np.ndarray, factor: th.Tensor) -> Degeneracy:
     return Degeneracy(np.sort(kept), _merged_groups(members, set(stand_in)), stand_in)
 
 
-def _pivots(remaining: np.ndarray) -> tuple[list[int], th.Tensor]:
+def _pivots(remaining: np.ndarray) -> tuple[list[int], np.ndarray]:
     """
     Cholesky factorisation with pivoting.
 
@@ -118,14 +118,14 @@ def _pivots(remaining: np.ndarray) -> tuple[list[int], th.Tensor]:
         left -= factor[row] ** 2
         left[pivot] = -np.inf
         pivots.append(pivot)
-    return pivots, th.from_numpy(factor[: len(pivots)])
+    return pivots, factor[: len(pivots)]
 
 
-def _inflation(factor: th.Tensor, n_last: int) -> np.ndarray:
+def _inflation(factor: np.ndarray, n_last: int) -> np.ndarray:
     # The last block of the factor is that of what the variables before it leave of the last ones
     last = factor[len(factor) - n_last :, len(factor) - n_last :]
-    inverse = th.linalg.solve_triangular(last, th.eye(n_last, dtype=last.dtype), upper=False)
-    return np.clip(inverse.square().sum(dim=0).numpy(), 1.0, 1.0 / DEPENDENT_SHARE)
+    inverse = solve_triangular(last, np.eye(n_last), lower=True)
+    return np.clip((inverse**2).sum(axis=0), 1.0, 1.0 / DEPENDENT_SHARE)
 
 
 def _merged_groups(members: list[set[int]], dependent: set[int]) -> tuple[tuple[int, ...], ...]:

@@ -170,7 +170,7 @@ def _add_products(deviations: np.ndarray, comoment: np.ndarray, cross: np.ndarra
         # Torch adds without another matrix of this size, which would be felt more than the other half
         th.from_numpy(comoment).addmm_(th.from_numpy(inputs).T, th.from_numpy(inputs))
     if targets.shape[1] > 0:
-        th.from_numpy(cross).addmm_(th.from_numpy(inputs).T, th.from_numpy(targets))
+        cross += inputs.T @ targets
 
 
 class StreamingMoments:

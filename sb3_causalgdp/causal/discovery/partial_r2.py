@@ -3,12 +3,13 @@ from typing import NamedTuple
 
 import numpy as np
 import torch as th
+from scipy.linalg import cho_solve
 
 from sb3_causalgdp.causal.basis import BASES, BasisExpansion, BasisMoments
 from sb3_causalgdp.causal.degenerate import Degeneracy, LimitsFinder
 from sb3_causalgdp.causal.graph import CausalGraph
 from sb3_causalgdp.causal.jackknife import jackknife_error
-from sb3_causalgdp.causal.matrices import cholesky_in_place
+from sb3_causalgdp.causal.matrices import cholesky_in_place, inverse_in_place, symmetric_product
 from sb3_causalgdp.causal.moments import Moments, Spread, StreamingMoments, leave_one_out
 from sb3_causalgdp.causal.variables import TransitionVariables
 
@@ -268,11 +269,10 @@ class _Regression:
         factor = self._factor(total)
         self.fit = self._fit(total, factor)
         self.raw_coefficients = self.fit.coefficients * th.from_numpy(self.inverse_scale)[:, None]
-        inverse = th.cholesky_inverse(factor, out=factor)
-        features_of_kept = expansion.features_of(degeneracy.kept)
-        self.tests = self._tests(features_of_kept, inverse)
         # In double precision: where features do not move, 1 / RIDGE here meets next to nothing in the scores
-        self.inverse = inverse
+        self.inverse = inverse_in_place(factor)
+        features_of_kept = expansion.features_of(degeneracy.kept)
+        self.tests = self._tests(features_of_kept)
         self.features_of_kept = th.from_numpy(features_of_kept)
         self.slopes, self.mean_slopes = self._slopes(statistics, expansion, inputs, 0.5 * deviation[inputs] / expansion.scale)
         self.whole = self._estimates(self.fit)
@@ -290,19 +290,20 @@ class _Regression:
         """
         if len(self.blocks) < 2:
             return
-        scores, squares = th.empty(self.n_features, len(self.blocks), self.shape[1], dtype=th.float64), []
-        for i, block in enumerate(self.blocks):
-            scores[:, i], of_block = self._scores(block)
-            squares.append(of_block)
-        scores *= th.from_numpy(self.inverse_scale)[:, None, None]
+        scores = np.empty((self.n_features, len(self.blocks), self.shape[1]))
+        for i, block in enumerate(self.blocks[:-1]):
+            scores[:, i] = self._scores(block)
+        # At the minimum all gradients add up to nothing
+        np.negative(scores[:, :-1].sum(axis=1), out=scores[:, -1])
+        squares = [self._squares(block, scores[:, i]) for i, block in enumerate(self.blocks)]
         # One product for all blocks: each alone would read the whole inverse
-        steps = th.from_numpy(self.inverse.numpy() @ scores.flatten(1).numpy()).view_as(scores)
+        steps = symmetric_product(self.inverse, scores.reshape(self.n_features, -1)).reshape(scores.shape)
         del scores
         for i, (block, rest) in enumerate(zip(self.blocks, leave_one_out(self.blocks), strict=True)):
             residual = np.sum(squares[:i] + squares[i + 1 :], axis=0) / rest.count
             yield self._estimates(self._step(steps[:, i], residual, rest)), block.count / self.total.count
 
-    def _factor(self, total: Moments) -> th.Tensor:
+    def _factor(self, total: Moments) -> np.ndarray:
         """Cholesky factor of the features' second moments S, in units of their standard deviations; takes the place of
         ``total.comoment``."""
         gram = total.comoment
@@ -311,17 +312,16 @@ class _Regression:
         diagonal = np.einsum("ii->i", gram)
         diagonal[self.inverse_scale == 0.0] = 1.0
         diagonal += self.ridge
-        # Another matrix of this size would be felt
         return cholesky_in_place(gram)
 
-    def _fit(self, total: Moments, factor: th.Tensor) -> _Fit:
+    def _fit(self, total: Moments, factor: np.ndarray) -> _Fit:
         cross = total.cross * self.inverse_scale[:, None] / (total.count * self.target_scale)
         deviation, variance, moves = self._units(total)
         cross[:, ~moves] = 0.0
-        coefficients = th.cholesky_solve(th.from_numpy(cross), factor)
+        coefficients = cho_solve((factor, True), cross, check_finite=False)
         # The ridge takes part of what is explained: b' (S + ridge) b = b' c
-        explained = np.einsum("ij,ij->j", coefficients.numpy(), cross + self.ridge[:, None] * coefficients.numpy())
-        return _Fit(coefficients, deviation, variance, _residual(variance - explained, variance))
+        explained = np.einsum("ij,ij->j", coefficients, cross + self.ridge[:, None] * coefficients)
+        return _Fit(th.from_numpy(coefficients), deviation, variance, _residual(variance - explained, variance))
 
     def _units(self, spread: Spread) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Deviations of the features and variances of the targets, in units of all rows; and which targets move."""
@@ -331,7 +331,7 @@ class _Regression:
         moves = self.target_moves & (variance > SMALLEST_DEVIATION**2)
         return deviation, np.where(moves, variance, 1.0), moves
 
-    def _tests(self, features_of_kept: np.ndarray, inverse: th.Tensor) -> list[_Tests]:
+    def _tests(self, features_of_kept: np.ndarray) -> list[_Tests]:
         in_group = {member for group in self.degeneracy.groups for member in group}
         left_out: dict[int, list[tuple[int, np.ndarray]]] = {}
         for cause, features in zip(self.degeneracy.kept.tolist(), features_of_kept, strict=True):
@@ -343,9 +343,10 @@ class _Regression:
         tests = []
         for together in left_out.values():
             causes, indices = (np.array(part) for part in zip(*together, strict=True))
-            features = th.from_numpy(indices)
-            spread = th.linalg.inv(inverse[features[:, :, None], features[:, None, :]])
-            tests.append(_Tests(causes, self.used[indices].sum(axis=1, keepdims=True), features, spread))
+            row, column = indices[:, :, None], indices[:, None, :]
+            of_features = self.inverse[np.maximum(row, column), np.minimum(row, column)]
+            spread = th.linalg.inv(th.from_numpy(of_features))
+            tests.append(_Tests(causes, self.used[indices].sum(axis=1, keepdims=True), th.from_numpy(indices), spread))
         return tests
 
     def _slopes(
@@ -372,23 +373,41 @@ class _Regression:
         units = th.from_numpy(self.inverse_scale)[self.features_of_kept][:, :, None]
         return slopes * units, differences.mean(dim=1)[:, :, None] * units
 
-    def _scores(self, block: Moments) -> tuple[th.Tensor, np.ndarray]:
+    def _scores(self, block: Moments) -> np.ndarray:
         """
-        Of the rows of one block: sums of the products of features and residuals, the gradient of least squares, shape (F, m);
-        and sums of the squared residuals, shape (m,). The targets are in units of all rows.
+        Of the rows of one block: sums of the products of features and residuals, less the block's part of the ridge. That is
+        minus the gradient of what is minimised, in units of the deviations in all rows; shape (F, m).
         """
-        raw = self.raw_coefficients
-        cross = th.from_numpy(block.cross / self.target_scale)
-        scores = cross - th.from_numpy(block.comoment @ raw.numpy())
-        squares = block.squares[self.n_features :] / self.target_scale**2
-        squares = squares - (raw * (cross + scores)).sum(dim=0).numpy()
-        # The block's means are not those of all rows
-        shift = block.mean - self.total.mean
-        residual = shift[self.n_features :] / self.target_scale - shift[: self.n_features] @ raw.numpy()
-        scores += th.outer(th.from_numpy(block.count * shift[: self.n_features]), th.from_numpy(residual))
-        return scores, np.maximum(squares + block.count * residual**2, 0.0)
+        raw = self.raw_coefficients.numpy()
+        scores = block.cross / self.target_scale
+        scores -= block.comoment @ raw
+        shift, residual = self._mean_residual(block)
+        scores += np.outer(block.count * shift, residual)
+        scores *= self.inverse_scale[:, None]
+        return scores - (block.count * self.ridge)[:, None] * self.fit.coefficients.numpy()
 
-    def _step(self, step: th.Tensor, residual: np.ndarray, rest: Spread) -> _Fit:
+    def _squares(self, block: Moments, scores: np.ndarray) -> np.ndarray:
+        """
+        :param block: Some of the rows
+        :param scores: What ``_scores`` says of it, shape (F, m)
+        :return: sums of the squared residuals there, in units of the targets' deviations in all rows, shape (m,)
+        """
+        coefficients = self.fit.coefficients.numpy()
+        shift, residual = self._mean_residual(block)
+        explained = np.einsum("ij,ij->j", self.raw_coefficients.numpy(), block.cross) / self.target_scale
+        explained += np.einsum("ij,ij->j", coefficients, scores)
+        explained += block.count * np.einsum("ij,ij,i->j", coefficients, coefficients, self.ridge)
+        explained -= block.count * (shift @ self.raw_coefficients.numpy()) * residual
+        squares = block.squares[self.n_features :] / self.target_scale**2 - explained + block.count * residual**2
+        return np.maximum(squares, 0.0)
+
+    def _mean_residual(self, block: Moments) -> tuple[np.ndarray, np.ndarray]:
+        """How far the means of the block's features, shape (F,), and residuals, shape (m,), are from those of all rows."""
+        shift = block.mean - self.total.mean
+        of_features = shift[: self.n_features]
+        return of_features, shift[self.n_features :] / self.target_scale - of_features @ self.raw_coefficients.numpy()
+
+    def _step(self, step: np.ndarray, residual: np.ndarray, rest: Spread) -> _Fit:
         """
         The fit without some rows.
 
@@ -400,7 +419,7 @@ class _Regression:
         still = deviation <= SMALLEST_DEVIATION
         # Residuals are smaller than the errors, by the features that were fitted to them
         size = np.sqrt(self.total.count / self.freedom) / rest.count
-        coefficients = self.fit.coefficients - size * step
+        coefficients = self.fit.coefficients - size * th.from_numpy(step)
         if still.any():
             coefficients[still] = 0.0
         if not moves.all():
