@@ -2,7 +2,7 @@
 
 import io
 import pathlib
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from functools import partial
 from typing import Any, ClassVar, NamedTuple, TypeVar
@@ -36,15 +36,15 @@ from sb3_causalgdp.causal.world_model import MaskedWorldModel
 from sb3_causalgdp.checks import check_at_least_zero, is_count
 from sb3_causalgdp.cuda_graphs import UpdateGraphs, why_not_recorded
 from sb3_causalgdp.device_replay import DeviceReplay
-from sb3_causalgdp.gradients import Gradients, check_compile, compiled, gradients_of
+from sb3_causalgdp.gradients import Gradients, check_compile, compiled, gradients_of, without_checks
 from sb3_causalgdp.losses import critic_loss, denoising_loss, q_loss, quantile, td_target, world_model_loss
 from sb3_causalgdp.offline.algorithm import OfflineToOnlineAlgorithm, callback_list
-from sb3_causalgdp.offline.replay import concatenate_samples, split_sample
+from sb3_causalgdp.offline.replay import concatenate_samples, deal_rows, rows_of
 from sb3_causalgdp.policies import CausalGDPPolicy, CnnPolicy, DiffusionActor, MlpPolicy, MultiInputPolicy, q_values
 from sb3_causalgdp.structural import StatePolicy, actions_of, make_structural_model, states_of
 
 ACTOR_UPDATES = ("one_step", "chain")
-COMPILED = ("_critic_gradients", "_world_model_gradients", "_actor_gradients")
+COMPILED = ("_td_target", "_critic_gradients", "_world_model_gradients", "_actor_gradients")
 
 SelfCausalGDP = TypeVar("SelfCausalGDP", bound="CausalGDP")
 
@@ -58,6 +58,13 @@ class StepPlan(NamedTuple):
     """Whether the denoising term is steered."""
     climbed: int
     """The critic whose value the actor climbs."""
+    running_weight: float
+    """Share of the batch's statistics that enters the running ones."""
+
+    @property
+    def trains_others(self) -> bool:
+        """Whether it trains more than the critics."""
+        return self.trains_world_model or self.trains_actor
 
 
 class CausalGDP(OfflineToOnlineAlgorithm):
@@ -562,55 +569,95 @@ class CausalGDP(OfflineToOnlineAlgorithm):
     def _gradient_steps(self, gradient_steps: int, batch_size: int) -> list[tuple[list[str], th.Tensor]]:
         """The losses of each step, their names and their values."""
         losses: list[tuple[list[str], th.Tensor]] = []
+        known_kinds: set[Hashable] = set()
         guided = self.policy.is_guided  # once, because a GPU has to be waited for
         if self._update_graphs is not None:
             self._update_graphs.update_learning_rates()
-        for replay_data in self._batches(gradient_steps, batch_size):
-            self._n_updates += 1
-            trains_world_model = self._n_updates % self.world_model_delay == 0
-            trains_actor = self._n_updates % self.policy_delay == 0
+        for n_steps, replay_data in self._batches(gradient_steps, batch_size):
+            plans = tuple(self._next_plan(guided) for _ in range(n_steps))
             batches = [replay_data]
-            if isinstance(self.replay_buffer, NStepReplayBuffer) and (trains_world_model or trains_actor):
-                batches.append(self._sample(batch_size, one_step=True))
-            climbed = int(np.random.randint(len(self.critic.q_networks))) if trains_actor else 0
-            plan = StepPlan(trains_world_model, trains_actor, guided, climbed)
-            step_losses = self._run_gradient_step(plan, batches)
-            # A copy, because the next step may overwrite them
-            losses.append((list(step_losses), th.stack(list(step_losses.values()))))
+            if isinstance(self.replay_buffer, NStepReplayBuffer):
+                batches += [self._sample(batch_size, one_step=True) for plan in plans if plan.trains_others]
+            # What compiled graphs depend on does not change within this call, so that one look at it is enough
+            kind = tuple(plan[:-1] for plan in plans)
+            with without_checks() if self.compile and kind in known_kinds else nullcontext():
+                losses_of_steps = self._run_gradient_steps(plans, batches)
+            known_kinds.add(kind)
+            names = [name for name, values in losses_of_steps.items() for _ in values]
+            # A copy, because the next steps may overwrite them
+            losses.append((names, th.cat(list(losses_of_steps.values()))))
         return losses
 
-    def _run_gradient_step(self, plan: StepPlan, batches: list[Any]) -> dict[str, th.Tensor]:
-        if self._update_graphs is None:
-            return self._gradient_step(plan, *batches)
-        # All that a step depends on and that may change while it trains
-        weights = (self._running_weight(), self.eta, self.denoising_weight, self.tau, self.gamma, self.max_grad_norm)
-        scales = (self.policy.state_guidance_scale, self.policy.outcome_guidance_scale)
-        kind = (plan, weights, scales, len(batches[0].rewards))
-        return self._update_graphs.run(kind, partial(self._gradient_step, plan), batches)
+    def _next_plan(self, guided: bool) -> StepPlan:
+        self._n_updates += 1
+        trains_actor = self._n_updates % self.policy_delay == 0
+        return StepPlan(
+            trains_world_model=self._n_updates % self.world_model_delay == 0,
+            trains_actor=trains_actor,
+            guided=guided,
+            climbed=int(np.random.randint(len(self.critic.q_networks))) if trains_actor else 0,
+            # The first batches are averaged, so that the start value is forgotten at once
+            running_weight=max(1.0 / self._n_updates, self.RUNNING_WEIGHT),
+        )
 
-    def _gradient_step(self, plan: StepPlan, replay_data: Any, one_step: Any = None) -> dict[str, th.Tensor]:
+    def _run_gradient_steps(self, plans: tuple[StepPlan, ...], batches: list[Any]) -> dict[str, th.Tensor]:
+        if self._update_graphs is None:
+            return self._steps_on_same_targets(plans, *batches)
+        # All that the steps depend on and that may change while it trains
+        weights = (self.eta, self.denoising_weight, self.tau, self.gamma, self.max_grad_norm)
+        scales = (self.policy.state_guidance_scale, self.policy.outcome_guidance_scale)
+        kind = (plans, weights, scales, len(batches[0].rewards))
+        return self._update_graphs.run(kind, partial(self._steps_on_same_targets, plans), batches)
+
+    def _steps_on_same_targets(self, plans: Sequence[StepPlan], replay_data: Any, *one_step: Any) -> dict[str, th.Tensor]:
         """
-        :param plan: What is updated
-        :param replay_data: Batch of the critics, and of the others unless they have their own
-        :param one_step: Batch of the world model and the actor where returns are of several steps
-        :return: Losses by name
+        Gradient steps between which the target networks stay as they are, so that the TD targets of all can be computed at
+        once.
+
+        :param plans: What each step updates
+        :param replay_data: Batches of the critics, one behind the other, and of the others unless they have their own
+        :param one_step: A batch for each step that trains more than the critics, where returns are of several steps
+        :return: Losses by name, one for each step that has it
         """
         if self.compile:
             # What a CUDA graph returned is overwritten from here on
             th.compiler.cudagraph_mark_step_begin()
+        next_actions, target = self._td_target(replay_data)
+        batch_size = len(target) // len(plans)
+        of_others = iter(one_step)
+        losses: dict[str, list[th.Tensor]] = {}
+        for index, plan in enumerate(plans):
+            rows = slice(index * batch_size, (index + 1) * batch_size)
+            own = next(of_others, None) if plan.trains_others else None
+            step_losses = self._gradient_step(plan, rows_of(replay_data, rows), next_actions[rows], target[rows], own)
+            for name, loss in step_losses.items():
+                losses.setdefault(name, []).append(loss)
+        return {name: th.stack(values) for name, values in losses.items()}
+
+    def _gradient_step(
+        self, plan: StepPlan, replay_data: Any, next_actions: th.Tensor, target: th.Tensor, one_step: Any = None
+    ) -> dict[str, th.Tensor]:
+        """
+        :param plan: What is updated
+        :param replay_data: Batch of the critics, and of the others unless they have their own
+        :param next_actions: Of the actor's moving average in the next states, shape ``(batch, d)``
+        :param target: TD target, shape ``(batch, 1)``
+        :param one_step: Batch of the world model and the actor where returns are of several steps
+        :return: Losses by name
+        """
         # The critics and the world model know nothing of each other
         beside_critics = nullcontext() if self._update_graphs is None else self._update_graphs.branch()
-        next_actions, losses = self._update_critics(replay_data)
+        losses = self._update_critics(replay_data, target, plan.running_weight)
         transitions = replay_data if one_step is None else one_step
         if plan.trains_world_model:
             with beside_critics:
-                losses.update(self._update_world_model(transitions))
+                losses.update(self._update_world_model(transitions, plan.running_weight))
         if plan.trains_actor:
             if one_step is not None:
                 with th.no_grad():
                     next_actions = self.actor_target.sample(self.actor_target.features(one_step.next_observations))
             losses.update(self._update_actor(transitions, next_actions, plan))
-        self._update_targets()
+            self._update_targets()
         return losses
 
     def _n_threads(self) -> int | None:
@@ -618,14 +665,18 @@ class CausalGDP(OfflineToOnlineAlgorithm):
             return self.torch_threads  # type: ignore[return-value]
         return None if self.policy.has_image_state else 1
 
-    def _batches(self, gradient_steps: int, batch_size: int) -> Iterator[Any]:
-        """The batch of each gradient step; drawn many at a time."""
+    def _batches(self, gradient_steps: int, batch_size: int) -> Iterator[tuple[int, Any]]:
+        """The batches of the next gradient steps, one behind the other, and of how many: of those up to the next update of the
+        target networks. They are drawn many at a time."""
         most_at_once = 1 if self.policy.has_image_state else max(1, self.MOST_ROWS_PER_DRAW // batch_size)
-        done = 0
-        while done < gradient_steps:
-            n_batches = min(most_at_once, gradient_steps - done)
-            yield from split_sample(self._sample(n_batches * batch_size), n_batches)
-            done += n_batches
+        for first in range(0, gradient_steps, most_at_once):
+            n_left = min(most_at_once, gradient_steps - first)
+            drawn, begin = deal_rows(self._sample(n_left * batch_size), n_left), 0
+            while n_left > 0:
+                n_steps = min(self.policy_delay - self._n_updates % self.policy_delay, n_left)
+                end = begin + n_steps * batch_size
+                yield n_steps, rows_of(drawn, slice(begin, end))
+                begin, n_left = end, n_left - n_steps
 
     def _sample(self, batch_size: int, one_step: bool = False) -> Any:
         """A batch from the replay buffer, from the preloaded transitions, or from both."""
@@ -657,42 +708,37 @@ class CausalGDP(OfflineToOnlineAlgorithm):
         indices = np.random.randint(0, replay_buffer.size(), size=batch_size)
         return ReplayBuffer._get_samples(replay_buffer, indices, env=self._vec_normalize_env)
 
-    def _update_critics(self, replay_data) -> tuple[th.Tensor, dict[str, th.Tensor]]:
-        next_actions, target_std, loss, gradients = self._critic_gradients(replay_data)
+    def _update_critics(self, replay_data, target: th.Tensor, running_weight: float) -> dict[str, th.Tensor]:
+        target_std, loss, gradients = self._critic_gradients(replay_data, target)
         self._step(self.critic, gradients)
         with th.no_grad():
-            self.policy.return_std.lerp_(target_std, self._running_weight())
-        return next_actions, {"critic_loss": loss}
+            self.policy.return_std.lerp_(target_std, running_weight)
+        return {"critic_loss": loss}
 
-    def _critic_gradients(self, replay_data) -> tuple[th.Tensor, th.Tensor, th.Tensor, Gradients]:
-        with th.no_grad():
-            next_actions, target = self._td_target(replay_data)
-            target_std = target.std(correction=0).clamp(min=1e-3)
+    def _critic_gradients(self, replay_data, target: th.Tensor) -> tuple[th.Tensor, th.Tensor, Gradients]:
+        target_std = target.std(correction=0).clamp(min=1e-3)
         loss = critic_loss(self.critic(replay_data.observations, replay_data.actions), target)
-        return next_actions, target_std, loss.detach(), gradients_of(self.critic, loss)
+        return target_std, loss.detach(), gradients_of(self.critic, loss)
 
     def _td_target(self, replay_data) -> tuple[th.Tensor, th.Tensor]:
         # For n-step replay, discount factor is gamma**n_steps (when no early termination)
         discounts = replay_data.discounts if replay_data.discounts is not None else self.gamma
         n_actions = self.N_BACKUP_ACTIONS if self.max_q_backup else 1
         next_observations = replay_data.next_observations
-        actor_features = self.actor_target.features(next_observations).repeat_interleave(n_actions, dim=0)
-        next_actions = self.actor_target.sample(actor_features)
-        critic_features = self.critic_target.extract_features(next_observations, self.critic_target.features_extractor)
-        next_q_values = q_values(self.critic_target, critic_features.repeat_interleave(n_actions, dim=0), next_actions)
-        target = td_target(next_q_values, replay_data.rewards, replay_data.dones, discounts, n_actions)
+        with th.no_grad():
+            actor_features = self.actor_target.features(next_observations).repeat_interleave(n_actions, dim=0)
+            next_actions = self.actor_target.sample(actor_features)
+            critic_features = self.critic_target.extract_features(next_observations, self.critic_target.features_extractor)
+            next_q_values = q_values(self.critic_target, critic_features.repeat_interleave(n_actions, dim=0), next_actions)
+            target = td_target(next_q_values, replay_data.rewards, replay_data.dones, discounts, n_actions)
         return next_actions[::n_actions], target
 
-    def _running_weight(self) -> float:
-        # The first batches are averaged, so that the start value is forgotten at once
-        return max(1.0 / self._n_updates, self.RUNNING_WEIGHT)
-
-    def _update_world_model(self, transitions) -> dict[str, th.Tensor]:
+    def _update_world_model(self, transitions, running_weight: float) -> dict[str, th.Tensor]:
         state = self.policy.causal_state(transitions.observations)
         next_state = self.policy.causal_state(transitions.next_observations)
         rewards = transitions.rewards.flatten()
         with th.no_grad():
-            self.policy.reward_target.lerp_(quantile(rewards, self.REWARD_QUANTILE), self._running_weight())
+            self.policy.reward_target.lerp_(quantile(rewards, self.REWARD_QUANTILE), running_weight)
         # The memory efficient buffer does not keep the last observation of an episode
         known = 1.0 - transitions.dones.flatten() if self.optimize_memory_usage else None
         transition, reward, gradients = self._world_model_gradients(state, transitions.actions, next_state, rewards, known)
@@ -755,10 +801,12 @@ class CausalGDP(OfflineToOnlineAlgorithm):
 
     @th.no_grad()
     def _update_targets(self) -> None:
+        # As often as the actor is updated, as in TD3, and each time as far as with tau at every gradient step
+        weight = 1.0 - (1.0 - self.tau) ** self.policy_delay
         # All parameters in one call, as SB3's polyak_update does one by one
         online = self._parameters[self.critic] + self._parameters[self.actor]
         targets = self._parameters[self.critic_target] + self._parameters[self.actor_target]
-        th._foreach_lerp_(targets, online, self.tau)
+        th._foreach_lerp_(targets, online, weight)
         # Copy running stats, see SB3's GH issue #996
         polyak_update(self.critic_batch_norm_stats, self.critic_batch_norm_stats_target, 1.0)
         polyak_update(self.actor_batch_norm_stats, self.actor_batch_norm_stats_target, 1.0)

@@ -8,7 +8,7 @@ from typing import Any
 
 import torch as th
 
-from sb3_causalgdp.offline.replay import leaves_of, map_leaves
+from sb3_causalgdp.offline.replay import leaves_of, map_sample
 
 Losses = dict[str, th.Tensor]
 Batches = Sequence[Any]
@@ -94,7 +94,7 @@ class UpdateGraphs:
     def _record(self, kind: Hashable, step: Callable[..., Losses], batches: Batches) -> None:
         if len(self._recordings) >= self.MOST_RECORDINGS:
             self._recordings.clear()
-        copies = [_copy(batch) for batch in batches]
+        copies = [map_sample(th.clone, batch) for batch in batches]
 
         def on_copies() -> Losses:
             with self._learning_rates_as_tensors():
@@ -168,7 +168,3 @@ def tensors_of(samples: Batches) -> Iterator[th.Tensor]:
         for part in sample:
             if part is not None:
                 yield from leaves_of(part)
-
-
-def _copy(sample: Any) -> Any:
-    return type(sample)(*(None if part is None else map_leaves(th.clone, part) for part in sample))

@@ -55,7 +55,7 @@ def compiled(function: Callable[..., Any], mode: bool | str, device: th.device) 
 
             options |= {"post_grad_custom_post_pass": OneDnnProducts()}
         run = th.compile(  # type: ignore[call-overload]  # the type stubs lack two arguments
-            function, options=options, isolate_recompiles=True, recompile_limit=_MOST_GRAPHS
+            function, dynamic=False, options=options, isolate_recompiles=True, recompile_limit=_MOST_GRAPHS
         )
         # One for all calls: to make one takes longer than to enter it
         return run, th._dynamo.config.patch(trace_autograd_ops=True)
@@ -67,6 +67,14 @@ def compiled(function: Callable[..., Any], mode: bool | str, device: th.device) 
             return run(*args)
 
     return call
+
+
+def without_checks() -> AbstractContextManager[None]:
+    """
+    :return: While it lasts, compiled functions see from their arguments alone which of their graphs to run, and not whether
+        anything else changed that these depend on: a twentieth of an update. Every graph that is run must have been run before
+    """
+    return th.compiler.set_stance(skip_guard_eval_unsafe=True)
 
 
 def check_compile(mode: bool | str, device: th.device) -> None:

@@ -108,7 +108,7 @@ def test_guidance_enters_the_actors_loss(trained, monkeypatch):
         th.manual_seed(0)
         with th.random.fork_rng(), monkeypatch.context() as patch:
             patch.setattr(model, "_step", lambda module, gradients: None)
-            plan = StepPlan(True, True, model.policy.is_guided, climbed=0)
+            plan = StepPlan(True, True, model.policy.is_guided, climbed=0, running_weight=0.01)
             return float(model._update_actor(data, data.actions, plan)["denoising_loss"])
 
     guided = denoising()
@@ -308,7 +308,8 @@ def test_targets_follow_slowly(trained):
         before = [parameter.clone() for parameter in target.parameters()]
         model._update_targets()
         for old, new, goal in zip(before, target.parameters(), online.parameters(), strict=True):
-            th.testing.assert_close(new, (1.0 - model.tau) * old + model.tau * goal)
+            weight = 1.0 - (1.0 - model.tau) ** model.policy_delay
+            th.testing.assert_close(new, (1.0 - weight) * old + weight * goal)
         assert any(not th.equal(old, goal) for old, goal in zip(before, online.parameters(), strict=True))
 
 
@@ -326,7 +327,7 @@ def test_a_gradient_step_trains_actor_critics_and_world_model_and_the_actors_los
             if any(not th.equal(old, new) for old, new in zip(before[name], module.parameters(), strict=True))
         }
 
-    plan = StepPlan(True, True, model.policy.is_guided, climbed=0)
+    plan = StepPlan(True, True, model.policy.is_guided, climbed=0, running_weight=0.01)
     assert changed_by(lambda: model._update_actor(data, data.actions, plan)) == {"actor"}
-    assert changed_by(lambda: model._update_critics(data)) == {"critic"}
-    assert changed_by(lambda: model._update_world_model(data)) == {"world_model"}
+    assert changed_by(lambda: model._update_critics(data, data.rewards, 0.01)) == {"critic"}
+    assert changed_by(lambda: model._update_world_model(data, 0.01)) == {"world_model"}

@@ -11,7 +11,7 @@ from stable_baselines3.common.type_aliases import ReplayBufferSamples
 
 from sb3_causalgdp import CausalGDP
 from sb3_causalgdp.losses import denoising_loss
-from sb3_causalgdp.offline.replay import split_sample
+from sb3_causalgdp.offline.replay import deal_rows, rows_of
 from sb3_causalgdp.policies import q_values
 
 KWARGS = {
@@ -72,6 +72,48 @@ def test_actor_and_world_model_are_updated_once_every_so_many_gradient_steps(pol
             name: not th.equal(before[name], th.nn.utils.parameters_to_vector(modules[name].parameters())) for name in modules
         }
         assert changed == {name: model._n_updates % delay == 0 for name, delay in delays.items()}
+
+
+@pytest.mark.parametrize("policy_delay", [1, 2, 3])
+def test_target_networks_follow_with_the_actor_as_far_as_with_tau_at_every_gradient_step(policy_delay, monkeypatch):
+    model = trained_model(policy_delay=policy_delay)
+    monkeypatch.setattr(model, "_step", lambda module, gradients: None)
+    online, target = (
+        th.nn.utils.parameters_to_vector([*actor.parameters(), *critic.parameters()]).clone()
+        for actor, critic in ((model.actor, model.critic), (model.actor_target, model.critic_target))
+    )
+    n_followed = model._n_updates // policy_delay * policy_delay
+    for _ in range(6):
+        model.train(gradient_steps=1, batch_size=32)
+        while n_followed <= model._n_updates - policy_delay:
+            for _ in range(policy_delay):
+                target = (1.0 - model.tau) * target + model.tau * online
+            n_followed += policy_delay
+        found = th.nn.utils.parameters_to_vector([*model.actor_target.parameters(), *model.critic_target.parameters()])
+        th.testing.assert_close(found, target, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("n_updates, sizes", [(8, [2, 2, 1]), (9, [1, 2, 2])])
+def test_td_targets_of_steps_on_the_same_target_networks_are_computed_at_once(n_updates, sizes, monkeypatch):
+    model = trained_model(policy_delay=2)
+    model._n_updates = n_updates
+    asked, given, td_target, update_critics = [], [], model._td_target, model._update_critics
+
+    def ask(data):
+        asked.append((data, td_target(data)[1]))
+        return data.actions, asked[-1][1]
+
+    def give(data, target, *args):
+        given.append((data, target.clone()))
+        return update_critics(data, target, *args)
+
+    monkeypatch.setattr(model, "_td_target", ask)
+    monkeypatch.setattr(model, "_update_critics", give)
+    model.train(gradient_steps=5, batch_size=32)
+    assert [len(target) for _, target in asked] == [32 * size for size in sizes]
+    assert th.equal(th.cat([data.rewards for data, _ in asked]), th.cat([data.rewards for data, _ in given]))
+    assert th.equal(th.cat([target for _, target in asked]), th.cat([target for _, target in given]))
+    assert all(len(target) == 32 for _, target in given)
 
 
 @pytest.mark.parametrize("name", ["policy_delay", "world_model_delay"])
@@ -155,14 +197,16 @@ def test_an_unknown_actor_update_is_refused():
 # Sampling ---------------------------------------------------------------------------------------------------------------
 
 
-def test_a_sample_is_split_into_batches_with_a_share_of_every_kind_of_row():
+def test_rows_are_dealt_to_batches_with_a_share_of_every_kind_of_row():
     rows = th.arange(12.0).unsqueeze(1)
     sample = ReplayBufferSamples({"a": rows}, rows + 100, {"a": rows}, rows, rows, None)
-    batches = split_sample(sample, 3)
+    dealt = deal_rows(sample, 3)
+    batches = [rows_of(dealt, slice(first, first + 4)) for first in (0, 4, 8)]
     assert [batch.observations["a"].flatten().tolist() for batch in batches] == [[0, 3, 6, 9], [1, 4, 7, 10], [2, 5, 8, 11]]
     assert th.equal(batches[2].actions, batches[2].observations["a"] + 100)
     assert batches[0].discounts is None
-    assert split_sample(sample, 1)[0] is sample
+    assert batches[1].rewards.is_contiguous() and batches[1].rewards.data_ptr() == dealt.rewards[4:].data_ptr()
+    assert deal_rows(sample, 1) is sample
 
 
 def test_many_gradient_steps_sample_the_buffer_once(monkeypatch):
@@ -181,7 +225,9 @@ def test_every_gradient_step_of_a_draw_has_its_own_rows(monkeypatch):
     model = trained_model()
     seen = []
     original = model._update_critics
-    monkeypatch.setattr(model, "_update_critics", lambda data: seen.append(data.actions.clone()) or original(data))
+    monkeypatch.setattr(
+        model, "_update_critics", lambda data, *args: seen.append(data.actions.clone()) or original(data, *args)
+    )
     model.train(gradient_steps=4, batch_size=32)
     assert [len(actions) for actions in seen] == [32] * 4
     assert len(np.unique(th.cat(seen).numpy(), axis=0)) > 64
@@ -202,7 +248,8 @@ def test_logs_are_means_over_the_gradient_steps(monkeypatch):
 
 def weights_after(model, seed=3):
     th.manual_seed(seed), np.random.seed(seed)
-    model.train(gradient_steps=3, batch_size=32)
+    # So many that every kind of step comes more than once
+    model.train(gradient_steps=12, batch_size=32)
     return model.policy.state_dict()
 
 
@@ -267,6 +314,20 @@ def test_an_update_is_one_graph_for_each_network_and_trains_as_without(tmp_path,
     assert_trains_alike(model, tmp_path)
 
 
+def test_what_changes_between_two_calls_is_seen(tmp_path, monkeypatch):
+    compile_for_tests(monkeypatch, backend="eager")
+    model = assert_trains_alike(trained_model(), tmp_path)
+    plain = CausalGDP.load(tmp_path / "model", env=model.get_env(), custom_objects={"compile": False})
+    plain.load_replay_buffer(tmp_path / "buffer")
+    plain.set_logger(Logger(None, []))
+    assert_same_weights(model.policy.state_dict(), weights_after(plain), rtol=1e-5, atol=1e-6)
+    for one in (model, plain):
+        one.gamma, one.eta = 0.5, 2.0
+        one.policy.outcome_guidance_scale *= 3.0
+        weights_after(one)
+    assert_same_weights(model.policy.state_dict(), plain.policy.state_dict(), rtol=1e-4, atol=1e-5)
+
+
 def test_what_a_compiler_made_trains_as_the_plain_code_and_is_saved_as_a_wish(tmp_path):
     policy_kwargs = {"net_arch": [8], "n_critics": 1, "world_model_net_arch": [8]}
     model = trained_model(policy_delay=1, policy_kwargs=policy_kwargs)
@@ -280,7 +341,7 @@ def test_what_a_compiler_made_trains_as_the_plain_code_and_is_saved_as_a_wish(tm
 
 @pytest.mark.parametrize(("torch_threads", "expected"), [("auto", 1), (2, 2), (None, 3)])
 def test_updates_run_with_the_threads_asked_for_and_give_them_back(torch_threads, expected, monkeypatch):
-    model = trained_model(torch_threads=torch_threads)
+    model = trained_model(torch_threads=torch_threads, policy_delay=1)
     seen = []
     original = model._update_targets
     monkeypatch.setattr(model, "_update_targets", lambda: seen.append(th.get_num_threads()) or original())

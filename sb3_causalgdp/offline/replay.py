@@ -46,6 +46,15 @@ def map_leaves(function: Callable[[Any], Any], part: Any) -> Any:
     return {key: function(values) for key, values in part.items()} if isinstance(part, dict) else function(part)
 
 
+def map_sample(function: Callable[[th.Tensor], th.Tensor], sample: Any) -> Any:
+    """
+    :param function: What is done to each tensor
+    :param sample: Sample of a replay buffer
+    :return: A sample of the results
+    """
+    return type(sample)(*(None if part is None else map_leaves(function, part) for part in sample))
+
+
 def leaves_of(part: Any) -> Iterator[Any]:
     """
     :param part: As for :func:`map_leaves`
@@ -54,26 +63,28 @@ def leaves_of(part: Any) -> Iterator[Any]:
     yield from part.values() if isinstance(part, dict) else (part,)
 
 
-def split_sample(sample: Any, n_parts: int) -> list[Any]:
+def deal_rows(sample: Any, n_parts: int) -> Any:
     """
-    Split one large sample into batches, each with its share of every kind of row: a HER sample, or one of several buffers, has
-    its kinds one behind the other, so that a batch takes every ``n_parts``-th row.
+    Put the rows of one large sample into the order of batches, one behind the other, each with its share of every kind of row:
+    a HER sample, or one of several buffers, has its kinds one behind the other, so that a batch takes every
+    ``n_parts``-th row.
 
     :param sample: Sample of a replay buffer
     :param n_parts: Number of batches
-    :return: The batches, each in one piece of memory
+    :return: The same rows
     """
     if n_parts == 1:
-        return [sample]
-    fields = [_split(part, n_parts) for part in sample]
-    return [type(sample)(*(field[index] for field in fields)) for index in range(n_parts)]
+        return sample
+    return map_sample(lambda values: values.unflatten(0, (-1, n_parts)).transpose(0, 1).flatten(0, 1), sample)
 
 
-def _split(part: Any, n_parts: int) -> Sequence[Any]:
-    if isinstance(part, dict):
-        split = {key: _split(values, n_parts) for key, values in part.items()}
-        return [{key: values[index] for key, values in split.items()} for index in range(n_parts)]
-    return [None] * n_parts if part is None else part.unflatten(0, (-1, n_parts)).transpose(0, 1).contiguous().unbind()
+def rows_of(sample: Any, rows: slice) -> Any:
+    """
+    :param sample: Sample of a replay buffer
+    :param rows: Which of its rows
+    :return: These, in the sample's own memory
+    """
+    return map_sample(lambda values: values[rows], sample)
 
 
 class SpacesEnv(VecEnv):
