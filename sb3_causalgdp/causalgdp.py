@@ -84,7 +84,7 @@ class CausalGDP(OfflineToOnlineAlgorithm):
         or, after :meth:`pretrain`, the policy's
     :param batch_size: Minibatch size for each gradient update
     :param tau: The soft update coefficient ("Polyak update", between 0 and 1) of the target critics and of the actor's moving
-        average
+        average, for each gradient step; they follow at every ``policy_delay``-th, as far as in so many
     :param gamma: The discount factor
     :param train_freq: Update the model every ``train_freq`` steps. Alternatively pass a tuple of frequency and unit
         like ``(5, "step")`` or ``(2, "episode")``.
@@ -105,7 +105,7 @@ class CausalGDP(OfflineToOnlineAlgorithm):
     :param actor_update: Which action the Q term of the policy loss judges. ``one_step``: the clean action that the noise
         prediction of the denoising term gives already (EDP, https://arxiv.org/abs/2305.20081), half the cost of an update;
         ``chain``: the end of the whole chain, through which the gradient then flows (Diffusion-QL)
-    :param policy_delay: The actor is updated once every so many gradient steps, as in TD3
+    :param policy_delay: The actor is updated, and the target networks follow, once every so many gradient steps, as in TD3
     :param world_model_delay: The world model is updated once every so many gradient steps
     :param max_q_backup: Whether the TD target takes the best of ten sampled actions (Diffusion-QL, for AntMaze)
     :param max_grad_norm: Bound of the gradient norms of the actor and of the critics, None for no bound
@@ -602,14 +602,14 @@ class CausalGDP(OfflineToOnlineAlgorithm):
 
     def _run_gradient_steps(self, plans: tuple[StepPlan, ...], batches: list[Any]) -> dict[str, th.Tensor]:
         if self._update_graphs is None:
-            return self._steps_on_same_targets(plans, *batches)
+            return self._steps_up_to_target_update(plans, *batches)
         # All that the steps depend on and that may change while it trains
         weights = (self.eta, self.denoising_weight, self.tau, self.gamma, self.max_grad_norm)
         scales = (self.policy.state_guidance_scale, self.policy.outcome_guidance_scale)
         kind = (plans, weights, scales, len(batches[0].rewards))
-        return self._update_graphs.run(kind, partial(self._steps_on_same_targets, plans), batches)
+        return self._update_graphs.run(kind, partial(self._steps_up_to_target_update, plans), batches)
 
-    def _steps_on_same_targets(self, plans: Sequence[StepPlan], replay_data: Any, *one_step: Any) -> dict[str, th.Tensor]:
+    def _steps_up_to_target_update(self, plans: Sequence[StepPlan], replay_data: Any, *one_step: Any) -> dict[str, th.Tensor]:
         """
         Gradient steps between which the target networks stay as they are, so that the TD targets of all can be computed at
         once.

@@ -255,13 +255,13 @@ class SpyingGDP(CausalGDP):
         self.seen = {"critics": [], "world model": [], "actor": []}
         super().__init__(*args, **kwargs)
 
-    def _update_critics(self, replay_data):
+    def _update_critics(self, replay_data, *args):
         self.seen["critics"].append(replay_data)
-        return super()._update_critics(replay_data)
+        return super()._update_critics(replay_data, *args)
 
-    def _update_world_model(self, transitions):
+    def _update_world_model(self, transitions, *args):
         self.seen["world model"].append(transitions)
-        return super()._update_world_model(transitions)
+        return super()._update_world_model(transitions, *args)
 
     def _update_actor(self, transitions, next_actions, guided):
         self.seen["actor"].append((transitions, next_actions))
