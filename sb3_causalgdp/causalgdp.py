@@ -3,7 +3,7 @@
 import io
 import pathlib
 from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from functools import partial
 from typing import Any, ClassVar, NamedTuple, TypeVar
 
@@ -622,6 +622,8 @@ class CausalGDP(OfflineToOnlineAlgorithm):
         if self.compile:
             # What a CUDA graph returned is overwritten from here on
             th.compiler.cudagraph_mark_step_begin()
+        # The critics and the world model know nothing of each other
+        beside_critics = nullcontext if self._update_graphs is None else self._update_graphs.branch()
         next_actions, target = self._td_target(replay_data)
         batch_size = len(target) // len(plans)
         of_others = iter(one_step)
@@ -629,28 +631,33 @@ class CausalGDP(OfflineToOnlineAlgorithm):
         for index, plan in enumerate(plans):
             rows = slice(index * batch_size, (index + 1) * batch_size)
             own = next(of_others, None) if plan.trains_others else None
-            step_losses = self._gradient_step(plan, rows_of(replay_data, rows), next_actions[rows], target[rows], own)
-            for name, loss in step_losses.items():
+            of_critics = rows_of(replay_data, rows), next_actions[rows], target[rows]
+            for name, loss in self._gradient_step(plan, *of_critics, own, beside_critics).items():
                 losses.setdefault(name, []).append(loss)
         return {name: th.stack(values) for name, values in losses.items()}
 
     def _gradient_step(
-        self, plan: StepPlan, replay_data: Any, next_actions: th.Tensor, target: th.Tensor, one_step: Any = None
+        self,
+        plan: StepPlan,
+        replay_data: Any,
+        next_actions: th.Tensor,
+        target: th.Tensor,
+        one_step: Any,
+        beside_critics: Callable[[], AbstractContextManager[None]],
     ) -> dict[str, th.Tensor]:
         """
         :param plan: What is updated
         :param replay_data: Batch of the critics, and of the others unless they have their own
         :param next_actions: Of the actor's moving average in the next states, shape ``(batch, d)``
         :param target: TD target, shape ``(batch, 1)``
-        :param one_step: Batch of the world model and the actor where returns are of several steps
+        :param one_step: Batch of the world model and the actor where returns are of several steps, else None
+        :param beside_critics: Makes the context in which the world model is updated
         :return: Losses by name
         """
-        # The critics and the world model know nothing of each other
-        beside_critics = nullcontext() if self._update_graphs is None else self._update_graphs.branch()
         losses = self._update_critics(replay_data, target, plan.running_weight)
         transitions = replay_data if one_step is None else one_step
         if plan.trains_world_model:
-            with beside_critics:
+            with beside_critics():
                 losses.update(self._update_world_model(transitions, plan.running_weight))
         if plan.trains_actor:
             if one_step is not None:

@@ -84,7 +84,7 @@ class UpdateGraphs:
         if kind not in self._recordings:
             self._n_runs[kind] += 1
             if self._n_runs[kind] <= self.WARM_UPS:
-                with self._own_stream(0):
+                with self._own_stream(0)():
                     return step(*batches)
             self._record(kind, step, batches)
         inputs, replay = self._recordings[kind]
@@ -108,16 +108,16 @@ class UpdateGraphs:
                 f"change (a features extractor or optimizer of your own?): {error}. cuda_graph=False works with it."
             ) from error
 
-    def _own_stream(self, index: int) -> AbstractContextManager[None]:
+    def _own_stream(self, index: int) -> Callable[[], AbstractContextManager[None]]:
         if self._streams is None:
-            return nullcontext()
+            return nullcontext
         stream = self._streams[index]
-        return _branch(stream, th.cuda.current_stream(stream.device).record_event())
+        return partial(_branch, stream, th.cuda.current_stream(stream.device).record_event())
 
-    def branch(self) -> AbstractContextManager[None]:
+    def branch(self) -> Callable[[], AbstractContextManager[None]]:
         """
-        :return: What is launched in this context runs, on a GPU, beside all that was launched between this call and it; what
-            is launched afterwards waits for both
+        :return: Makes contexts. What is launched in them runs, on a GPU, beside all that was launched between this call and
+            the context; what is launched afterwards waits for both
         """
         return self._own_stream(1)
 
