@@ -580,7 +580,8 @@ class CausalGDP(OfflineToOnlineAlgorithm):
                 batches += [self._sample(batch_size, one_step=True) for plan in plans if plan.trains_others]
             # What compiled graphs depend on does not change within this call, so that one look at it is enough
             kind = tuple(plan[:-1] for plan in plans)
-            with without_checks() if self.compile and kind in known_kinds else nullcontext():
+            looked_at = kind in known_kinds and self._update_graphs is None
+            with without_checks() if self.compile and looked_at else nullcontext():
                 losses_of_steps = self._run_gradient_steps(plans, batches)
             known_kinds.add(kind)
             names = [name for name, values in losses_of_steps.items() for _ in values]
