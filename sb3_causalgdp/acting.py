@@ -79,14 +79,10 @@ ACTIVATIONS: dict[type[nn.Module], Activation] = {
 }
 
 
-def _clip(values: np.ndarray, bounds: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+def _clip(values: np.ndarray, lowest: np.ndarray = _MINUS_ONE, highest: np.ndarray = _ONE) -> np.ndarray:
     # Half of the time of ndarray.clip
-    raised = np.maximum(values, bounds[0])
-    return np.minimum(raised, bounds[1], out=raised)
-
-
-def _clip_action(values: np.ndarray) -> np.ndarray:
-    return _clip(values, (_MINUS_ONE, _ONE))
+    raised = np.maximum(values, lowest)
+    return np.minimum(raised, highest, out=raised)
 
 
 Layer = tuple[np.ndarray, np.ndarray]
@@ -225,34 +221,38 @@ class _Denoiser:
             hidden += bias
         return hidden
 
+    def scaled(self, noise: np.ndarray) -> np.ndarray:
+        """What each diffusion step adds of the noise, in the order of the chain, shape ``(K, d, batch)``."""
+        return self.stds * noise[self.noise_rows]
+
     def sample(
         self,
         bound: np.ndarray,
-        noise: np.ndarray,
+        action: np.ndarray,
+        scaled_noise: np.ndarray,
         first_prediction: np.ndarray | None = None,
         shift: Callable[[np.ndarray, int], np.ndarray] | None = None,
     ) -> np.ndarray:
         """
-        The chain of :func:`sb3_causalgdp.diffusion.sample`; noise of shape ``(K, d, batch)``, actions ``(d, batch)``. What the
-        denoiser says of the start does not depend on the guidance, so a second chain need not ask again. ``shift`` says by how
-        much the guidance moves a clean estimate.
+        The chain of :func:`sb3_causalgdp.diffusion.sample`, from a noisy action of shape ``(d, batch)``. What the denoiser
+        says of the start does not depend on the guidance, so a second chain need not ask again. ``shift`` says by how much the
+        guidance moves a clean estimate.
         """
-        action, predicted = noise[0], first_prediction
-        scaled = self.stds * noise[self.noise_rows]
+        predicted = first_prediction
         for position, (k, step) in enumerate(self.chain):
             if predicted is None:
                 predicted = self.predict_noise(action, bound[k])
             clean = step.clean(action, predicted)
             if shift is not None:
-                clean += shift(_clip_action(clean), k)
-            action, predicted = step.next(_clip_action(clean), action, scaled[position]), None
+                clean += shift(_clip(clean), k)
+            action, predicted = step.next(_clip(clean), action, scaled_noise[position]), None
         return action
 
     def adapt(self, features: np.ndarray, action: np.ndarray, time_part: np.ndarray) -> np.ndarray:
         """:meth:`DiffusionActor.adapt`, features of shape ``(n, batch)``, actions ``(d, batch)``."""
         step = self.steps[self.adapting_step]
         noisy = step.signal * action
-        return _clip_action(step.clean(noisy, self.predict_noise(noisy, self.bind(features, time_part[self.adapting_step]))))
+        return _clip(step.clean(noisy, self.predict_noise(noisy, self.bind(features, time_part[self.adapting_step]))))
 
 
 class _Hidden(NamedTuple):
@@ -326,7 +326,7 @@ class _Critics:
         inputs = np.concatenate([state, action])
         passes = [network.forward(inputs) for network in self.networks]
         smallest = np.argmin(np.concatenate([values for values, _ in passes]), axis=0)
-        if len(set(smallest.tolist())) == 1:
+        if len(smallest) == 1 or (smallest == smallest[0]).all():
             return self.networks[smallest[0]].backward(passes[smallest[0]][1], len(state))
         gradient = np.empty_like(state)
         for index, (network, (_, hidden)) in enumerate(zip(self.networks, passes, strict=True)):
@@ -383,12 +383,12 @@ class _WorldModel:
         change = np.minimum(arrays["change_variance"] / (state_std * state_std), _MOST_CHANGE)
         residual_std = np.maximum(np.sqrt(closed * closed + gate * change), _SMALLEST_STD)
         standardised = (state - arrays["state_mean"]) / state_std
-        inputs = np.concatenate([_clip(standardised, self.input_bounds), action], axis=1)
+        inputs = np.concatenate([_clip(standardised, *self.input_bounds), action], axis=1)
         mask = np.concatenate([arrays["state_to_state"], arrays["action_to_state"]], axis=1)
         change, jacobian = self.transition.forward_and_jacobian(inputs, mask, n_states)
         next_standardised = gate * standardised + residual_std * change
-        noise_std = np.exp(_clip(arrays["transition_log_std"], self.log_std_bounds))
-        reward_inputs = np.concatenate([_clip(next_standardised, self.input_bounds), action], axis=1)
+        noise_std = np.exp(_clip(arrays["transition_log_std"], *self.log_std_bounds))
+        reward_inputs = np.concatenate([_clip(next_standardised, *self.input_bounds), action], axis=1)
         reward_mask = np.concatenate([arrays["state_to_reward"], arrays["action_to_reward"]])[None]
         reward, reward_gradient = self.reward.forward_and_jacobian(reward_inputs, reward_mask, 0)
         reward_gradient = reward_scale * reward_gradient[0]
@@ -397,11 +397,17 @@ class _WorldModel:
             "next_state": arrays["state_mean"] + state_std * next_standardised,
             "next_state_std": noise_std * residual_std * state_std,
             "standardised_jacobian": (jacobian / noise_std[:, None, None]).transpose(1, 0, 2),
-            "reward": arrays["reward_mean"] + reward_scale * reward[:, 0],
-            "reward_std": np.exp(arrays["reward_log_std"].clip(*self.log_std_bounds)) * reward_scale,
+            "standardised_reward": reward[:, 0],
             "reward_by_next_state": reward_gradient[:, :n_states] * within / state_std,
             "reward_by_action": reward_gradient[:, n_states:],
         }
+
+    def reward_distribution(self, standardised: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Means and standard deviation in the environment's units, from the standardised means."""
+        arrays = self.arrays
+        scale = np.maximum(np.sqrt(arrays["reward_variance"]), _SMALLEST_STD)
+        std = np.exp(arrays["reward_log_std"].clip(*self.log_std_bounds)) * scale
+        return arrays["reward_mean"] + scale * standardised, std
 
 
 class _Rule:
@@ -437,6 +443,10 @@ class _Rule:
             slopes, offsets = both[..., :-1], both[..., -1:]
         else:
             slopes, offsets = self.factor * curvature, self.factor * at_zero
+        if len(best) == 1:
+            # The views of several rows take longer than the products
+            slope_of, offset_of = list(slopes[:, 0]), list(offsets[:, 0])
+            return lambda clean, step: offset_of[step] - slope_of[step].dot(clean)
         return lambda clean, step: (offsets[step] - slopes[step] @ clean.T[:, :, None])[:, :, 0].T
 
 
@@ -564,16 +574,18 @@ class NumpyActing:
         bound = self.denoiser.bind(features.T, time_part)
         noise = noise.transpose(0, 2, 1)
         repeated = bound if n_candidates == 1 else np.repeat(bound, n_candidates, axis=2)
-        first_prediction = self.denoiser.predict_noise(noise[0], repeated[-1])
-        action = self.denoiser.sample(repeated, noise, first_prediction).T
+        start, scaled_noise = noise[0], self.denoiser.scaled(noise)
+        first_prediction = self.denoiser.predict_noise(start, repeated[-1])
+        action = self.denoiser.sample(repeated, start, scaled_noise, first_prediction).T
         if n_candidates > 1:
             values = self.critics.values(features.T, action.T, n_candidates).reshape(-1, n_candidates)
             best = np.arange(0, len(action), n_candidates) + values.argmax(axis=1)
-            action, noise, first_prediction = action[best], noise[:, :, best], first_prediction[:, best]
+            action, start, first_prediction = action[best], start[:, best], first_prediction[:, best]
+            scaled_noise = scaled_noise[:, :, best]
         if guided:
             assert self.rule is not None
             shift = self.rule.shift(action, *self._local_model(policy, features, action, time_part))
-            action = self.denoiser.sample(bound, noise, first_prediction, shift).T
+            action = self.denoiser.sample(bound, start, scaled_noise, first_prediction, shift).T
         return np.ascontiguousarray(action)
 
     def _local_model(
@@ -586,8 +598,8 @@ class NumpyActing:
             error, std = _ONE, self.return_std
             by_next_state = by_next_state + np.float32(policy.discount) * self._value_gradient(response, action, time_part)
         else:
-            std = response["reward_std"]
-            error = ((self.reward_target - response["reward"]) / std)[:, None]
+            reward, std = self.world_model.reward_distribution(response["standardised_reward"])
+            error = ((self.reward_target - reward) / std)[:, None]
         to_state = response["standardised_jacobian"]
         jacobian = (by_action + ((by_next_state * response["next_state_std"])[:, None] @ to_state)[:, 0]) / std
         scale = np.float32(policy.outcome_guidance_scale)
