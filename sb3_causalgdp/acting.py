@@ -72,7 +72,7 @@ def _silu_derivative(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 ACTIVATIONS: dict[type[nn.Module], Activation] = {
-    nn.ReLU: Activation(lambda x: np.maximum(x, _ZERO), lambda x, y: (y > _ZERO).astype(y.dtype)),
+    nn.ReLU: Activation(lambda x: np.maximum(x, _ZERO), lambda x, y: y > _ZERO),
     nn.Tanh: Activation(np.tanh, lambda x, y: _ONE - y * y),
     nn.Mish: Activation(lambda x: x * _tanh_of_softplus(x), _mish_derivative),
     nn.SiLU: Activation(lambda x: x * _sigmoid(x), _silu_derivative),

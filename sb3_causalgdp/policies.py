@@ -571,10 +571,9 @@ class CausalGDPPolicy(BasePolicy):
         return self._predict(observation, deterministic=deterministic)
 
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
-        with th.no_grad():
-            action = self._act(observation, deterministic)
-            if not deterministic and self.exploration_noise > 0.0:
-                action = (action + self.exploration_noise * th.randn_like(action)).clamp(-1.0, 1.0)
+        action = self._act(observation, deterministic)
+        if not deterministic and self.exploration_noise > 0.0:
+            action = (action + self.exploration_noise * th.randn_like(action)).clamp(-1.0, 1.0)
         return action
 
     def _act(self, observation: PyTorchObs, deterministic: bool) -> th.Tensor:
@@ -584,8 +583,9 @@ class CausalGDPPolicy(BasePolicy):
             noise = self._candidate_noise(len(observation), deterministic).cpu().numpy()
             actions = acting(self, observation.float().flatten(1).cpu().numpy(), noise, self.is_guided)
             return th.as_tensor(actions, device=observation.device)
-        features = self.actor.features(observation)
-        return self._act_in_torch(observation, features, self._candidate_noise(len(features), deterministic))
+        with th.no_grad():
+            features = self.actor.features(observation)
+            return self._act_in_torch(observation, features, self._candidate_noise(len(features), deterministic))
 
     def _numpy_acting(self, observation: PyTorchObs) -> NumpyActing | None:
         """The fast path for few rows, where it covers this policy; made anew when the networks were moved or replaced."""
