@@ -84,7 +84,7 @@ class CausalGDP(OfflineToOnlineAlgorithm):
         or, after :meth:`pretrain`, the policy's
     :param batch_size: Minibatch size for each gradient update
     :param tau: The soft update coefficient ("Polyak update", between 0 and 1) of the target critics and of the actor's moving
-        average, for each gradient step; they follow at every ``policy_delay``-th, as far as in so many
+        average
     :param gamma: The discount factor
     :param train_freq: Update the model every ``train_freq`` steps. Alternatively pass a tuple of frequency and unit
         like ``(5, "step")`` or ``(2, "episode")``.
@@ -105,7 +105,8 @@ class CausalGDP(OfflineToOnlineAlgorithm):
     :param actor_update: Which action the Q term of the policy loss judges. ``one_step``: the clean action that the noise
         prediction of the denoising term gives already (EDP, https://arxiv.org/abs/2305.20081), half the cost of an update;
         ``chain``: the end of the whole chain, through which the gradient then flows (Diffusion-QL)
-    :param policy_delay: The actor is updated, and the target networks follow, once every so many gradient steps, as in TD3
+    :param policy_delay: The actor is updated once every so many gradient steps, as in TD3. Where a call of :meth:`train` makes
+        many steps, the TD targets of those from one update of the actor to the next are computed at once
     :param world_model_delay: The world model is updated once every so many gradient steps
     :param max_q_backup: Whether the TD target takes the best of ten sampled actions (Diffusion-QL, for AntMaze)
     :param max_grad_norm: Bound of the gradient norms of the actor and of the critics, None for no bound
@@ -603,17 +604,17 @@ class CausalGDP(OfflineToOnlineAlgorithm):
 
     def _run_gradient_steps(self, plans: tuple[StepPlan, ...], batches: list[Any]) -> dict[str, th.Tensor]:
         if self._update_graphs is None:
-            return self._steps_up_to_target_update(plans, *batches)
+            return self._steps_up_to_actor_update(plans, *batches)
         # All that the steps depend on and that may change while it trains
         weights = (self.eta, self.denoising_weight, self.tau, self.gamma, self.max_grad_norm)
         scales = (self.policy.state_guidance_scale, self.policy.outcome_guidance_scale)
         kind = (plans, weights, scales, len(batches[0].rewards))
-        return self._update_graphs.run(kind, partial(self._steps_up_to_target_update, plans), batches)
+        return self._update_graphs.run(kind, partial(self._steps_up_to_actor_update, plans), batches)
 
-    def _steps_up_to_target_update(self, plans: Sequence[StepPlan], replay_data: Any, *one_step: Any) -> dict[str, th.Tensor]:
+    def _steps_up_to_actor_update(self, plans: Sequence[StepPlan], replay_data: Any, *one_step: Any) -> dict[str, th.Tensor]:
         """
-        Gradient steps between which the target networks stay as they are, so that the TD targets of all can be computed at
-        once.
+        Gradient steps of which only the last may train the actor. The TD targets of all are computed at once, before the
+        target networks have moved by what is left of ``tau`` in so few steps.
 
         :param plans: What each step updates
         :param replay_data: Batches of the critics, one behind the other, and of the others unless they have their own
@@ -665,7 +666,7 @@ class CausalGDP(OfflineToOnlineAlgorithm):
                 with th.no_grad():
                     next_actions = self.actor_target.sample(self.actor_target.features(one_step.next_observations))
             losses.update(self._update_actor(transitions, next_actions, plan))
-            self._update_targets()
+        self._update_targets()
         return losses
 
     def _n_threads(self) -> int | None:
@@ -675,7 +676,7 @@ class CausalGDP(OfflineToOnlineAlgorithm):
 
     def _batches(self, gradient_steps: int, batch_size: int) -> Iterator[tuple[int, Any]]:
         """The batches of the next gradient steps, one behind the other, and of how many: of those up to the next update of the
-        target networks. They are drawn many at a time."""
+        actor. They are drawn many at a time."""
         most_at_once = 1 if self.policy.has_image_state else max(1, self.MOST_ROWS_PER_DRAW // batch_size)
         for first in range(0, gradient_steps, most_at_once):
             n_left = min(most_at_once, gradient_steps - first)
@@ -809,12 +810,10 @@ class CausalGDP(OfflineToOnlineAlgorithm):
 
     @th.no_grad()
     def _update_targets(self) -> None:
-        # As often as the actor is updated, as in TD3, and each time as far as with tau at every gradient step
-        weight = 1.0 - (1.0 - self.tau) ** self.policy_delay
         # All parameters in one call, as SB3's polyak_update does one by one
         online = self._parameters[self.critic] + self._parameters[self.actor]
         targets = self._parameters[self.critic_target] + self._parameters[self.actor_target]
-        th._foreach_lerp_(targets, online, weight)
+        th._foreach_lerp_(targets, online, self.tau)
         # Copy running stats, see SB3's GH issue #996
         polyak_update(self.critic_batch_norm_stats, self.critic_batch_norm_stats_target, 1.0)
         polyak_update(self.actor_batch_norm_stats, self.actor_batch_norm_stats_target, 1.0)

@@ -308,8 +308,7 @@ def test_targets_follow_slowly(trained):
         before = [parameter.clone() for parameter in target.parameters()]
         model._update_targets()
         for old, new, goal in zip(before, target.parameters(), online.parameters(), strict=True):
-            weight = 1.0 - (1.0 - model.tau) ** model.policy_delay
-            th.testing.assert_close(new, (1.0 - weight) * old + weight * goal)
+            th.testing.assert_close(new, (1.0 - model.tau) * old + model.tau * goal)
         assert any(not th.equal(old, goal) for old, goal in zip(before, online.parameters(), strict=True))
 
 

@@ -38,7 +38,8 @@ def test_updates_can_be_asked_for_one_at_a_time(config):
 def test_the_parts_of_an_update_make_up_all_of_it(config):
     profile = CausalGDPContestant(config).profile(5)
     assert sum(profile["parts"].values()) == pytest.approx(profile["wrapped"])
-    assert profile["wrapped"] > profile["functions"]["sb3_causalgdp.causalgdp.CausalGDP.train"]["inclusive"]
+    # Not more, because a processor's clock may tick in milliseconds
+    assert profile["wrapped"] >= profile["functions"]["sb3_causalgdp.causalgdp.CausalGDP.train"]["inclusive"] > 0.0
     assert {"critics", "TD target", "optimizers", "sample", "targets", "world model"} <= set(profile["parts"])
 
 
