@@ -326,7 +326,7 @@ class _Critics:
         inputs = np.concatenate([state, action])
         passes = [network.forward(inputs) for network in self.networks]
         smallest = np.argmin(np.concatenate([values for values, _ in passes]), axis=0)
-        if len(smallest) == 1 or (smallest == smallest[0]).all():
+        if len(set(smallest.tolist())) == 1:
             return self.networks[smallest[0]].backward(passes[smallest[0]][1], len(state))
         gradient = np.empty_like(state)
         for index, (network, (_, hidden)) in enumerate(zip(self.networks, passes, strict=True)):

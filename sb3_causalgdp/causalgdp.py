@@ -579,8 +579,9 @@ class CausalGDP(OfflineToOnlineAlgorithm):
             batches = [replay_data]
             if isinstance(self.replay_buffer, NStepReplayBuffer):
                 batches += [self._sample(batch_size, one_step=True) for plan in plans if plan.trains_others]
-            # What compiled graphs depend on does not change within this call, so that one look at it is enough
-            kind = tuple(plan[:-1] for plan in plans)
+            # What compiled graphs depend on does not change within this call, so that one look at it is enough; the weights of
+            # running averages are outside of them
+            kind = tuple(plan._replace(running_weight=0.0) for plan in plans)
             looked_at = kind in known_kinds and self._update_graphs is None
             with without_checks() if self.compile and looked_at else nullcontext():
                 losses_of_steps = self._run_gradient_steps(plans, batches)
@@ -613,8 +614,8 @@ class CausalGDP(OfflineToOnlineAlgorithm):
 
     def _steps_up_to_actor_update(self, plans: Sequence[StepPlan], replay_data: Any, *one_step: Any) -> dict[str, th.Tensor]:
         """
-        Gradient steps of which only the last may train the actor. The TD targets of all are computed at once, before the
-        target networks have moved by what is left of ``tau`` in so few steps.
+        Gradient steps of which only the last may train the actor. The TD targets of all are computed at once, with the target
+        networks as they are before the first.
 
         :param plans: What each step updates
         :param replay_data: Batches of the critics, one behind the other, and of the others unless they have their own

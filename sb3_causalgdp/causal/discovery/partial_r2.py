@@ -269,6 +269,7 @@ class _Regression:
         factor = self._factor(total)
         self.fit = self._fit(total, factor)
         self.raw_coefficients = self.fit.coefficients * th.from_numpy(self.inverse_scale)[:, None]
+        self.penalty = self.ridge[:, None] * self.fit.coefficients.numpy()
         # In double precision: where features do not move, 1 / RIDGE here meets next to nothing in the scores
         self.inverse = inverse_in_place(factor)
         features_of_kept = expansion.features_of(degeneracy.kept)
@@ -378,13 +379,13 @@ class _Regression:
         Of the rows of one block: sums of the products of features and residuals, less the block's part of the ridge. That is
         minus the gradient of what is minimised, in units of the deviations in all rows; shape (F, m).
         """
-        raw = self.raw_coefficients.numpy()
         scores = block.cross / self.target_scale
-        scores -= block.comoment @ raw
-        shift, residual = self._mean_residual(block)
-        scores += np.outer(block.count * shift, residual)
+        scores -= block.comoment @ self.raw_coefficients.numpy()
+        of_features, _, residual = self._shifts(block)
+        scores += np.outer(block.count * of_features, residual)
         scores *= self.inverse_scale[:, None]
-        return scores - (block.count * self.ridge)[:, None] * self.fit.coefficients.numpy()
+        scores -= block.count * self.penalty
+        return scores
 
     def _squares(self, block: Moments, scores: np.ndarray) -> np.ndarray:
         """
@@ -392,20 +393,18 @@ class _Regression:
         :param scores: What ``_scores`` says of it, shape (F, m)
         :return: sums of the squared residuals there, in units of the targets' deviations in all rows, shape (m,)
         """
-        coefficients = self.fit.coefficients.numpy()
-        shift, residual = self._mean_residual(block)
+        _, of_targets, residual = self._shifts(block)
         explained = np.einsum("ij,ij->j", self.raw_coefficients.numpy(), block.cross) / self.target_scale
-        explained += np.einsum("ij,ij->j", coefficients, scores)
-        explained += block.count * np.einsum("ij,ij,i->j", coefficients, coefficients, self.ridge)
-        explained -= block.count * (shift @ self.raw_coefficients.numpy()) * residual
-        squares = block.squares[self.n_features :] / self.target_scale**2 - explained + block.count * residual**2
+        explained += np.einsum("ij,ij->j", self.fit.coefficients.numpy(), scores + block.count * self.penalty)
+        squares = block.squares[self.n_features :] / self.target_scale**2 - explained + block.count * residual * of_targets
         return np.maximum(squares, 0.0)
 
-    def _mean_residual(self, block: Moments) -> tuple[np.ndarray, np.ndarray]:
-        """How far the means of the block's features, shape (F,), and residuals, shape (m,), are from those of all rows."""
+    def _shifts(self, block: Moments) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """How far the means of the block's features, shape (F,), and of its targets and residuals, each of shape (m,), are
+        from those of all rows."""
         shift = block.mean - self.total.mean
-        of_features = shift[: self.n_features]
-        return of_features, shift[self.n_features :] / self.target_scale - of_features @ self.raw_coefficients.numpy()
+        of_features, of_targets = shift[: self.n_features], shift[self.n_features :] / self.target_scale
+        return of_features, of_targets, of_targets - of_features @ self.raw_coefficients.numpy()
 
     def _step(self, step: np.ndarray, residual: np.ndarray, rest: Spread) -> _Fit:
         """
