@@ -60,7 +60,8 @@ class CausalWorldModelCallback(BaseCallback):
         self._counted_steps = self.model.num_timesteps
 
     def _on_training_start(self) -> None:
-        if self.model.is_pretraining:
+        # A resumed call goes on in the middle, between two refreshes
+        if self.model.is_pretraining and self.model._resumed_at_gradient_step != self.model.n_pretrain_steps:
             self.refresh()
 
     def _on_step(self) -> bool:

@@ -30,12 +30,14 @@ from sb3_causalgdp.causal import (
     make_discovery,
     make_statistics,
 )
-from sb3_causalgdp.causal.graph import replaced_when_done
 from sb3_causalgdp.causal.interventions import ActionRule
 from sb3_causalgdp.causal.world_model import MaskedWorldModel
+from sb3_causalgdp.checkpoints import TrainingCheckpointCallback, begin_training, resume, save_checkpoint
+from sb3_causalgdp.checkpoints.checkpoint import all_callbacks, bookkeeping_of, fresh_seed
 from sb3_causalgdp.checks import check_at_least_zero, is_count
 from sb3_causalgdp.cuda_graphs import UpdateGraphs, why_not_recorded
 from sb3_causalgdp.device_replay import DeviceReplay
+from sb3_causalgdp.files import saved_when_done
 from sb3_causalgdp.gradients import Gradients, check_compile, compiled, gradients_of, without_checks
 from sb3_causalgdp.losses import critic_loss, denoising_loss, q_loss, quantile, td_target, world_model_loss
 from sb3_causalgdp.offline.algorithm import OfflineToOnlineAlgorithm, callback_list
@@ -317,6 +319,7 @@ class CausalGDP(OfflineToOnlineAlgorithm):
         self._fed_offline_position = 0
         self._fed_marks: list[str] = []
         self._device_replays: dict[str, tuple[ReplayBuffer, DeviceReplay | None]] = {}
+        self._resumed_at_gradient_step: int | None = None
 
         check_compile(self.compile, self.device)
         if _init_setup_model:
@@ -332,6 +335,9 @@ class CausalGDP(OfflineToOnlineAlgorithm):
             super()._setup_model()
         finally:
             self.policy_kwargs = policy_kwargs
+        if self.num_timesteps > 0 and self.seed is not None:
+            # A loaded model would live through the random numbers and start states of its first steps again
+            self.set_random_seed(fresh_seed(self))
         self._create_aliases()
         self._setup_compile()
         self._setup_cuda_graphs()
@@ -436,13 +442,17 @@ class CausalGDP(OfflineToOnlineAlgorithm):
         check_compile(self.compile, self.device)
         self._check_cuda_graph()
         callbacks = callback_list(callback)
-        n_own = sum(isinstance(one, CausalWorldModelCallback) for top in callbacks for one in _flatten(top))
+        n_own = sum(isinstance(one, CausalWorldModelCallback) for top in callbacks for one in all_callbacks(top))
         if n_own > 1:
             raise ValueError(f"At most one CausalWorldModelCallback can be passed, got {n_own}")
         if n_own == 0:
             # In front of the others, so that evaluations and checkpoints see the new masks
             callbacks = [CausalWorldModelCallback(), *callbacks]
-        return super()._init_callback(CallbackList(callbacks), progress_bar)
+        # Behind the others, which have then counted the step that a checkpoint of pretrain() is about
+        callbacks = sorted(callbacks, key=lambda one: isinstance(one, TrainingCheckpointCallback))
+        all_of_them = super()._init_callback(CallbackList(callbacks), progress_bar)
+        begin_training(self, all_of_them)
+        return all_of_them
 
     def causal_graph(self) -> CausalGraph:
         """
@@ -899,14 +909,52 @@ class CausalGDP(OfflineToOnlineAlgorithm):
         :param exclude: Name of parameters that should be excluded in addition to the default ones
         :param include: Name of parameters that might be excluded but should be included anyway
         """
-        if not isinstance(path, (str, pathlib.Path)):
-            super().save(path, exclude, include)
-            return
-        target = pathlib.Path(path)
-        if target.suffix == "":
-            target = pathlib.Path(f"{path}.zip")
-        with replaced_when_done(target) as temporary:
-            super().save(temporary, exclude, include)
+        with saved_when_done(path, ".zip") as file:
+            super().save(file, exclude, include)
+
+    def save_checkpoint(self, path: str | pathlib.Path, callback: BaseCallback | None = None) -> pathlib.Path:
+        """
+        Write all that the training is in one piece: weights, optimizers, replay buffer and preloaded transitions, statistics,
+        graphs, counters, random number generators, and the state of the environment. :meth:`resume` goes on from it, bit for
+        bit where it was written between two rollouts, as :class:`~sb3_causalgdp.TrainingCheckpointCallback` does.
+
+        :param path: A folder, to which only new transitions are added, or a file with the suffix ``.zip``
+        :param callback: The callbacks of the training, to save what they counted
+        :return: The file, or the checkpoint's folder inside the folder
+        :raises ValueError: If the folder holds checkpoints of another training
+        """
+        return save_checkpoint(self, path, callback)
+
+    @classmethod
+    def resume(
+        cls: type[SelfCausalGDP],
+        path: str | pathlib.Path,
+        env: GymEnv | None = None,
+        device: th.device | str = "auto",
+        trusted: bool = False,
+    ) -> SelfCausalGDP:
+        """
+        Make the model of an interrupted training, with its replay buffer and the state of its environment, from the newest
+        whole checkpoint. ``model.learn(model.remaining_timesteps, reset_num_timesteps=False)`` does the rest.
+
+        :param path: Folder of checkpoints, one of them, or a zip file
+        :param env: Environment that is made as the first one was; None where :meth:`pretrain` goes on
+        :param device: Device on which the code should be run
+        :param trusted: Whether the files may name Python objects that could run code
+        :return: The model
+        :raises FileNotFoundError: If there is no checkpoint
+        :raises ValueError: If none is whole, or the environment is another one
+        """
+        model = resume(cls, path, env, device, trusted)
+        stage = bookkeeping_of(model)
+        if stage.of_pretraining and not stage.was_complete:
+            model._resumed_at_gradient_step = model.n_pretrain_steps
+        return model
+
+    @property
+    def remaining_timesteps(self) -> int:
+        """Environment steps that ``learn()`` was to take and has not taken yet."""
+        return max(0, self._total_timesteps - self.num_timesteps)
 
     def _excluded_save_params(self) -> list[str]:
         return super()._excluded_save_params() + [  # noqa: RUF005
@@ -919,6 +967,8 @@ class CausalGDP(OfflineToOnlineAlgorithm):
             *COMPILED,
             "discovery",
             "_fed_offline_position",
+            "_checkpoints",
+            "_resumed_at_gradient_step",
             "_device_replays",
             "_update_graphs",
             "causal_graph_history",
@@ -951,14 +1001,3 @@ def _threads(n_threads: int | None) -> Iterator[None]:
         yield
     finally:
         th.set_num_threads(before)
-
-
-def _flatten(callback: BaseCallback) -> list[BaseCallback]:
-    """The callback and all that it holds, through lists and event callbacks."""
-    found = [callback]
-    for one in getattr(callback, "callbacks", []):
-        found += _flatten(one)
-    child = getattr(callback, "callback", None)
-    if isinstance(child, BaseCallback):
-        found += _flatten(child)
-    return found

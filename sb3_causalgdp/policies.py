@@ -25,6 +25,7 @@ from sb3_causalgdp.causal.guidance import OutcomeTarget
 from sb3_causalgdp.checks import check_at_least_zero
 from sb3_causalgdp.diffusion import Guidance, GuidanceRule, MLPDenoiser, NoiseSchedule, sample
 from sb3_causalgdp.diffusion.samplers import bind, check_sampler
+from sb3_causalgdp.files import saved_when_done
 from sb3_causalgdp.products import make_layers_fast
 
 ACTIVATIONS: dict[str, type[nn.Module]] = {
@@ -436,6 +437,15 @@ class CausalGDPPolicy(BasePolicy):
             **self.guidance_kwargs,
         )
         return data
+
+    def save(self, path: str) -> None:
+        """
+        Save the policy alone; a file is replaced only once the new one is complete.
+
+        :param path: File, or file-like object
+        """
+        with saved_when_done(path, "") as file:
+            super().save(file)
 
     @property
     def device(self) -> th.device:

@@ -12,13 +12,13 @@ LAYERS = [
     {"pictures"},
     {"__init__"},
     {"causalgdp"},
-    {"callbacks"},
-    {"losses", "gradients", "diagnostics", "structural", "device_replay", "cuda_graphs"},
+    {"callbacks", "checkpoints"},
+    {"losses", "gradients", "diagnostics", "structural", "device_replay", "cuda_graphs", "files"},
     {"product_pass"},
     {"policies"},
     {"acting"},
     {"causal", "offline", "diffusion"},
-    {"checks", "products", "activations"},
+    {"checks", "files", "products", "activations"},
 ]
 WITHOUT_SB3 = {"causal", "diffusion", "losses", "gradients", "products", "product_pass", "activations", "cuda_graphs"}
 LEVELS = {part: level for level, parts in enumerate(LAYERS) for part in parts}

@@ -3,7 +3,8 @@
 import os
 from collections.abc import Sequence
 
-from sb3_causalgdp.causal.graph import PLOTS_HINT, replaced_when_done
+from sb3_causalgdp.causal.graph import PLOTS_HINT
+from sb3_causalgdp.files import replaced_when_done
 from sb3_causalgdp.causal.variables import TransitionVariables
 
 try:

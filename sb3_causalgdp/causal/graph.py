@@ -1,8 +1,6 @@
 import json
 import os
-import uuid
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -10,6 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from sb3_causalgdp.causal.variables import TransitionVariables
+from sb3_causalgdp.files import replaced_when_done
 
 if TYPE_CHECKING:
     import networkx as nx
@@ -390,24 +389,6 @@ class CausalGraph:
         from sb3_causalgdp.causal.plots import plot_causal_graph
 
         return plot_causal_graph(self, path, kind, max_variables, values=values, groups=groups, aggregate=aggregate)
-
-
-@contextmanager
-def replaced_when_done(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """
-    Give a temporary file beside ``path``, of the same suffix, to write to; it takes the place of ``path`` if the block ends
-    without an error.
-
-    :param path: File to write; its folder is created
-    """
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{uuid.uuid4().hex}.{path.name}")
-    try:
-        yield temporary
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def _equal(one: Any, other: Any) -> bool:

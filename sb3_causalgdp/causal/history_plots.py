@@ -8,7 +8,8 @@ from itertools import pairwise
 import numpy as np
 
 from sb3_causalgdp.causal.figures import FONT_SIZE, check_choice, check_suffix, save_figure
-from sb3_causalgdp.causal.graph import PLOTS_HINT, CausalGraph, replaced_when_done
+from sb3_causalgdp.causal.graph import PLOTS_HINT, CausalGraph
+from sb3_causalgdp.files import replaced_when_done
 from sb3_causalgdp.causal.heat_maps import (
     VALUES,
     draw_matrix,

@@ -18,6 +18,7 @@ from stable_baselines3.common.type_aliases import MaybeCallback, Schedule
 from stable_baselines3.common.utils import FloatSchedule, configure_logger
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
+from sb3_causalgdp.files import saved_when_done
 from sb3_causalgdp.offline.observations import flat_space
 from sb3_causalgdp.offline.preload import check_buffer, copy_rows, positions_needed, preload_buffer, spaces_of
 from sb3_causalgdp.offline.replay import SpacesEnv, can_sample
@@ -244,6 +245,7 @@ class OfflineToOnlineAlgorithm(OffPolicyAlgorithm):
                     break
                 if log_interval is not None and self.num_timesteps % log_interval == 0:
                     self._dump_pretrain_logs()
+            self._steps_since_refresh = 0
             callback.on_training_end()
         return self
 
@@ -293,7 +295,10 @@ class OfflineToOnlineAlgorithm(OffPolicyAlgorithm):
         assert self.env is not None, "You must set the environment before calling learn()"
         self._load_offline_dataset(progress_bar)
         if self._n_pretrain_steps < self.pretrain_steps:
-            self.pretrain(self.pretrain_steps - self._n_pretrain_steps, progress_bar=progress_bar)
+            steps = self.pretrain_steps - self._n_pretrain_steps
+            # Callbacks that say so are for both stages
+            both = [one for one in callback_list(callback) if getattr(one, "during_pretraining", False)]
+            self.pretrain(steps, both, progress_bar=progress_bar)
         if self.offline_buffer is not None and self.offline_buffer is self.replay_buffer:
             self.replay_buffer = self._new_buffer(self.buffer_size)
         return super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
@@ -326,14 +331,16 @@ class OfflineToOnlineAlgorithm(OffPolicyAlgorithm):
 
     def save_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase) -> None:
         """
-        Save the replay buffer as a pickle file, and with it the preloaded transitions.
+        Save the replay buffer as a pickle file, and with it the preloaded transitions. A file is replaced only once the new
+        one is complete.
 
         :param path: Path to the file where the replay buffer should be saved
         """
         assert self.replay_buffer is not None
         self.replay_buffer.offline_part = (self.offline_buffer, self._offline_marks)  # type: ignore[attr-defined]
         try:
-            super().save_replay_buffer(path)
+            with saved_when_done(path, ".pkl") as file:
+                super().save_replay_buffer(file)
         finally:
             del self.replay_buffer.offline_part  # type: ignore[attr-defined]
 

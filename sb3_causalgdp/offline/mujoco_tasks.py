@@ -1,6 +1,5 @@
 """Data of locomotion tasks, as D4RL's: from a policy that SAC trained half-way, or from that training itself."""
 
-import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +11,7 @@ from stable_baselines3 import SAC
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
 
+from sb3_causalgdp.files import remove_folder, renamed_when_done
 from sb3_causalgdp.offline.extras import need
 from sb3_causalgdp.offline.scores import normalized_score
 from sb3_causalgdp.offline.storage import Episode, make_environment
@@ -118,15 +118,12 @@ class Training:
     def _save(self) -> None:
         """Under a temporary name first, so that the newest checkpoint is always whole."""
         path = self.folder / f"{self.model.num_timesteps:010d}"
-        staging = path.with_suffix(".writing")
-        shutil.rmtree(staging, ignore_errors=True)
-        staging.mkdir(parents=True)
-        self.model.save(staging / "model.zip")
-        np.savez(staging / "transitions.npz", **_transitions(self.model), score=np.float64(self.score))
-        staging.rename(path)
+        with renamed_when_done(path) as folder:
+            self.model.save(folder / "model.zip")
+            np.savez(folder / "transitions.npz", **_transitions(self.model), score=np.float64(self.score))
         for other in self.folder.iterdir():
             if other != path:
-                shutil.rmtree(other)
+                remove_folder(other)
 
     def _restored(self) -> SAC | None:
         checkpoints = sorted(path for path in self.folder.glob("*") if path.name.isdigit())

@@ -1,11 +1,9 @@
 """Writing Minari datasets that are either complete or not there."""
 
 import os
-import shutil
-import tempfile
 import warnings
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,6 +11,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from sb3_causalgdp.files import move_folder, temporary_folder
 from sb3_causalgdp.offline.extras import need
 from sb3_causalgdp.offline.scores import find_reference
 
@@ -119,11 +118,9 @@ def write_dataset(
     """
     check_new_dataset(dataset_id, root)
     minari = need("minari")
-    root.mkdir(parents=True, exist_ok=True)
     environment = make_environment(environment_id, max_episode_steps)
     reference = find_reference(dataset_id)
-    staging = Path(tempfile.mkdtemp(prefix=".making-", dir=root))
-    try:
+    with temporary_folder(root) as staging, closing(environment):
         with minari_root(staging), warnings.catch_warnings():
             # An author's e-mail and a permalink are for datasets that get published
             warnings.filterwarnings("ignore", message="`(author|author_email|code_permalink)` is set to None")
@@ -139,9 +136,6 @@ def write_dataset(
                 **metadata,
             )
         _publish(dataset_id, staging, root)
-    finally:
-        shutil.rmtree(staging, ignore_errors=True)
-        environment.close()
     return root / dataset_id
 
 
@@ -166,4 +160,4 @@ def _publish(dataset_id: str, staging: Path, root: Path) -> None:
     with minari_root(root):
         if namespace and namespace not in namespaces.list_local_namespaces():
             namespaces.create_namespace(namespace)
-    os.rename(staging / dataset_id, root / dataset_id)
+    move_folder(staging / dataset_id, root / dataset_id)

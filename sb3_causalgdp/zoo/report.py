@@ -13,7 +13,7 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_causalgdp import CausalGDP
-from sb3_causalgdp.causal.graph import replaced_when_done
+from sb3_causalgdp.files import replaced_when_done
 from sb3_causalgdp.zoo.registration import ALGORITHM, SetupError, WithoutReplayBuffer
 from sb3_causalgdp.zoo.report_sections import Played, make_sections
 from sb3_causalgdp.zoo.run_folder import RunFolder, find_runs
