@@ -1,108 +1,229 @@
 """
-Learning curves of CausalGDP beside other algorithms: the same environment, seeds, evaluation and process set-up.
+Learning curves of CausalGDP beside other algorithms: the same environments, seeds, evaluation and process set-up.
 
-    python benchmarks/learning/run.py --env HalfCheetah-v5 --steps 30000 --algorithms causalgdp sac --seeds 0 1 2
-    python benchmarks/learning/run.py --env Pendulum-v1 --steps 10000 --algorithms causalgdp --seeds 0 1 2 3 4 --episodes 20
+    python benchmarks/learning/run.py --env HalfCheetah-v5 --steps 100000 --algorithms causalgdp sac tqc --seeds 0 1 2
+    python benchmarks/learning/run.py --env Hopper-v5 --name wide --kwargs '{"policy_kwargs": {"net_arch": [512, 512]}}'
+    python benchmarks/learning/run.py --queue benchmarks/learning/queue.txt
 
-Each run is a process of its own with one torch thread. A run that has its file is not run again, so that an interrupted
-benchmark goes on where it was. Results: one CSV per run in ``benchmarks/learning/results/``; ``plot.py`` draws them.
+CausalGDP runs with its defaults, the others with RL Zoo's settings. Each run is a process of its own with one torch thread. Its
+CSV in ``benchmarks/learning/results/`` grows with each evaluation. A run that was interrupted goes on from its newest checkpoint
+in ``benchmarks/learning/checkpoints/``; one that is complete is not run again, unless it is asked for with more steps. A queue
+is a file with the arguments of one call in each line; it is read anew after each run, and several processes can work on it.
+``summary.py`` draws the results and prints their statistics.
 """
 
 import argparse
 import csv
+import fcntl
 import json
 import os
+import shlex
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any, NamedTuple
+
+from contestants import NAMES, class_of, make_model
 
 COLUMNS = ("timesteps", "mean_return", "std_return", "wall_seconds", "cpu_seconds")
-RESULTS = Path(__file__).parent / "results"
+HERE = Path(__file__).parent
+RESULTS, CHECKPOINTS = HERE / "results", HERE / "checkpoints"
+CHECKPOINT_EVERY = 10_000
 
 
-def result_path(folder: Path, env_id: str, algorithm: str, seed: int) -> Path:
-    return folder / f"{env_id}_{algorithm}_{seed}.csv"
+class Run(NamedTuple):
+    """One seed of one setting."""
+
+    env: str
+    algorithm: str
+    name: str
+    seed: int
+    steps: int
+    eval_freq: int
+    episodes: int
+    kwargs: dict[str, Any]
+    folder: Path
+    checkpoints: Path
+
+    @property
+    def title(self) -> str:
+        return f"{self.env}_{self.name}_{self.seed}"
+
+    @property
+    def result(self) -> Path:
+        return self.folder / f"{self.title}.csv"
+
+    def is_complete(self) -> bool:
+        return self.result.exists() and last_timestep(self.result) >= self.steps
 
 
-def run_one(args: argparse.Namespace) -> None:
-    """Train one seed and write its evaluations."""
+def last_timestep(path: Path) -> float:
+    """Of the last evaluation in a CSV file."""
+    lines = path.read_text(encoding="utf-8").splitlines()
+    return float(lines[-1].split(",")[0]) if len(lines) > 1 else 0.0
+
+
+# One run ------------------------------------------------------------------------------------------------------------------
+
+
+def train(run: Run) -> None:
+    """Train one seed, from its newest checkpoint if there is one, and write its evaluations."""
     import torch as th
-    from sb3_contrib import TQC
-    from stable_baselines3 import SAC, TD3
     from stable_baselines3.common.callbacks import BaseCallback
     from stable_baselines3.common.env_util import make_vec_env
     from stable_baselines3.common.evaluation import evaluate_policy
 
-    from sb3_causalgdp import CausalGDP
+    from sb3_causalgdp import TrainingCheckpointCallback
+    from sb3_causalgdp.checkpoints import resume
+    from sb3_causalgdp.files import replaced_when_done
 
     th.set_num_threads(1)
-    classes = {"causalgdp": CausalGDP, "sac": SAC, "td3": TD3, "tqc": TQC}
-    algorithm, seed = args.algorithms[0], args.seeds[0]
-    # Episodes are evaluated side by side, one for each environment
-    evaluation_env = make_vec_env(args.env, n_envs=args.episodes, seed=10_000 + seed)
-    rows: list[dict[str, float]] = []
-    start = time.perf_counter()
-    cpu_start = time.process_time()
 
     class Evaluate(BaseCallback):
+        """What it counts is part of the checkpoints."""
+
+        def __init__(self) -> None:
+            super().__init__()
+            # Episodes are evaluated side by side, one for each environment
+            self.env = make_vec_env(run.env, n_envs=run.episodes)
+            self.rows: list[tuple[float, ...]] = []
+            self.spent = (0.0, 0.0)
+            self._clock: tuple[float, float] | None = None
+
+        def _on_rollout_start(self) -> None:
+            now = (time.perf_counter(), time.process_time())
+            if self._clock is not None:
+                wall, cpu = (spent + end - start for spent, end, start in zip(self.spent, now, self._clock, strict=True))
+                self.spent = (wall, cpu)
+            self._clock = now
+
+        def _on_training_start(self) -> None:
+            self._clock = None
+
         def _on_step(self) -> bool:
-            if self.num_timesteps % args.eval_freq == 0:
-                spent = time.perf_counter() - start, time.process_time() - cpu_start
-                state = th.get_rng_state()
-                evaluation_env.seed(10_000 + seed)
-                mean, std = evaluate_policy(self.model, evaluation_env, n_eval_episodes=args.episodes, warn=False)
-                th.set_rng_state(state)
-                values = (self.num_timesteps, mean, std, *spent)
-                rows.append(dict(zip(COLUMNS, values, strict=True)))  # type: ignore[arg-type]
-                print(algorithm, seed, {key: round(float(value), 1) for key, value in rows[-1].items()}, flush=True)
+            if self.num_timesteps % run.eval_freq == 0:
+                self._on_rollout_start()
+                self._evaluate()
+                # Evaluations do not count
+                self._clock = (time.perf_counter(), time.process_time())
             return True
 
-    model = classes[algorithm]("MlpPolicy", args.env, seed=seed, **args.kwargs)
-    model.learn(args.steps, callback=Evaluate())
-    path = result_path(args.folder, args.env, args.name or algorithm, seed)
-    temporary = path.with_suffix(".tmp")
-    with temporary.open("w", newline="") as file:
-        writer = csv.DictWriter(file, fieldnames=COLUMNS, lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
-    os.replace(temporary, path)
+        def _evaluate(self) -> None:
+            state = th.get_rng_state()
+            self.env.seed(10_000 + run.seed)
+            mean, std = evaluate_policy(self.model, self.env, n_eval_episodes=run.episodes, warn=False)
+            th.set_rng_state(state)
+            values = (self.num_timesteps, mean, std, *self.spent)
+            self.rows = [*self.rows, tuple(round(float(value), 3) for value in values)]
+            with replaced_when_done(run.result) as file, file.open("w", newline="") as stream:
+                writer = csv.writer(stream, lineterminator="\n")
+                writer.writerows([COLUMNS, *self.rows])
+            print(time.strftime("%H:%M"), run.title, *self.rows[-1], flush=True)
+
+    checkpoints = run.checkpoints / run.title
+    training_env = make_vec_env(run.env, seed=run.seed)
+    try:
+        model = resume(class_of(run.algorithm), checkpoints, training_env, "cpu")
+        print(f"{run.title} goes on after {model.num_timesteps} steps", flush=True)
+    except FileNotFoundError:
+        model = make_model(run.algorithm, training_env, run.seed, device="cpu", **run.kwargs)
+    saving = TrainingCheckpointCallback(checkpoints, every=CHECKPOINT_EVERY, keep=1)
+    model.learn(max(0, run.steps - model.num_timesteps), [Evaluate(), saving], reset_num_timesteps=False)
 
 
-def run_all(args: argparse.Namespace) -> None:
-    """Run what has no result yet, ``--workers`` processes at a time."""
-    args.folder.mkdir(parents=True, exist_ok=True)
+# All runs -----------------------------------------------------------------------------------------------------------------
 
-    def launch(algorithm: str, seed: int) -> None:
-        if result_path(args.folder, args.env, args.name or algorithm, seed).exists():
-            return
-        command = [sys.executable, __file__, "--one", "--env", args.env, "--steps", str(args.steps)]
-        command += ["--algorithms", algorithm, "--seeds", str(seed), "--eval-freq", str(args.eval_freq)]
-        command += ["--episodes", str(args.episodes), "--folder", str(args.folder), "--kwargs", json.dumps(args.kwargs)]
-        command += ["--name", args.name] if args.name else []
+
+def make_parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--env", default="HalfCheetah-v5")
+    parser.add_argument("--steps", type=int, default=100_000)
+    parser.add_argument("--algorithms", nargs="+", choices=NAMES, default=["causalgdp"])
+    parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
+    parser.add_argument("--eval-freq", type=int, default=5_000)
+    parser.add_argument("--episodes", type=int, default=10)
+    parser.add_argument("--workers", type=int, default=1)
+    parser.add_argument("--folder", type=Path, default=RESULTS)
+    parser.add_argument("--checkpoints", type=Path, default=CHECKPOINTS)
+    parser.add_argument("--kwargs", type=json.loads, default={}, help="arguments of the algorithm, as JSON")
+    parser.add_argument("--name", help="name of this variant in the results, the algorithm's own by default")
+    parser.add_argument("--queue", type=Path, help="file with the arguments of one call in each line")
+    parser.add_argument("--one", action="store_true", help=argparse.SUPPRESS)
+    return parser
+
+
+def runs_of(arguments: argparse.Namespace) -> Iterator[Run]:
+    for seed in arguments.seeds:
+        for algorithm in arguments.algorithms:
+            yield Run(
+                arguments.env,
+                algorithm,
+                arguments.name or algorithm,
+                seed,
+                arguments.steps,
+                arguments.eval_freq,
+                arguments.episodes,
+                arguments.kwargs,
+                arguments.folder,
+                arguments.checkpoints,
+            )
+
+
+def runs_of_queue(path: Path) -> Iterator[Run]:
+    for line in path.read_text(encoding="utf-8").splitlines():
+        words = shlex.split(line, comments=True)
+        if words:
+            yield from runs_of(make_parser().parse_args(words))
+
+
+def launch(run: Run) -> bool:
+    """Run it in a process of its own, unless it is complete or somebody else is at it; whether it was run."""
+    if run.is_complete():
+        return False
+    run.checkpoints.mkdir(parents=True, exist_ok=True)
+    with open(run.checkpoints / f"{run.title}.lock", "w") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return False
+        command = [sys.executable, __file__, "--one", "--env", run.env, "--steps", str(run.steps), "--name", run.name]
+        command += ["--algorithms", run.algorithm, "--seeds", str(run.seed), "--eval-freq", str(run.eval_freq)]
+        command += ["--episodes", str(run.episodes), "--folder", str(run.folder), "--checkpoints", str(run.checkpoints)]
+        command += ["--kwargs", json.dumps(run.kwargs)]
         subprocess.run(command, check=True, env={**os.environ, "OMP_NUM_THREADS": "1"})
+    return True
 
-    with ThreadPoolExecutor(args.workers) as pool:
-        for future in [pool.submit(launch, name, seed) for seed in args.seeds for name in args.algorithms]:
-            future.result()
+
+def work_on(queue: Path) -> None:
+    """Until all runs of the queue are complete or failed."""
+    failed: set[str] = set()
+    while True:
+        for run in runs_of_queue(queue):
+            if run.title in failed:
+                continue
+            try:
+                if launch(run):
+                    break
+            except subprocess.CalledProcessError as error:
+                failed.add(run.title)
+                print(f"{run.title} failed: {error}", file=sys.stderr, flush=True)
+        else:
+            return
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--env", default="HalfCheetah-v5")
-    parser.add_argument("--steps", type=int, default=30_000)
-    parser.add_argument("--algorithms", nargs="+", default=["causalgdp", "sac"])
-    parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
-    parser.add_argument("--eval-freq", type=int, default=2_500)
-    parser.add_argument("--episodes", type=int, default=5)
-    parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument("--folder", type=Path, default=RESULTS)
-    parser.add_argument("--kwargs", type=json.loads, default={}, help="arguments of the algorithm, as JSON")
-    parser.add_argument("--name", help="name of this variant in the results, the algorithm's own by default")
-    parser.add_argument("--one", action="store_true", help=argparse.SUPPRESS)
-    args = parser.parse_args()
-    run_one(args) if args.one else run_all(args)
+    arguments = make_parser().parse_args()
+    if arguments.one:
+        train(next(runs_of(arguments)))
+    elif arguments.queue:
+        work_on(arguments.queue)
+    else:
+        with ThreadPoolExecutor(arguments.workers) as pool:
+            for future in [pool.submit(launch, run) for run in runs_of(arguments)]:
+                future.result()
 
 
 if __name__ == "__main__":

@@ -403,7 +403,15 @@ def set_callback_states(callback: BaseCallback, states: list[dict[str, Any]]) ->
         for name, of_environment in state["environments"].items():
             env = vars(one).get(name)
             if isinstance(env, VecEnv) and not of_environment["problems"]:
-                restore_environment(env, of_environment)
+                _restore_if_same(env, of_environment, f"{type(one).__name__}.{name}")
+
+
+def _restore_if_same(env: VecEnv, state: dict[str, Any], name: str) -> None:
+    try:
+        restore_environment(env, state)
+    except ValueError as error:
+        # It has no part in the training
+        warnings.warn(f"The environments of {name} begin anew: {error}")
 
 
 def _name(callback: BaseCallback) -> str:

@@ -1,0 +1,61 @@
+"""Who runs: the class of each algorithm and the settings that its users take."""
+
+import importlib.util
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+PEERS = ("sac", "td3", "tqc", "crossq")
+NAMES = ("causalgdp", *PEERS)
+
+
+def make_model(algorithm: str, env: Any, seed: int, **arguments: Any) -> Any:
+    """
+    :param algorithm: One of ``NAMES``
+    :param env: The environments
+    :param seed: Seed
+    :param arguments: Of the constructor, on top of the settings
+    :return: The model: CausalGDP with its defaults, the others with RL Zoo's settings
+    """
+    settings = {} if algorithm == "causalgdp" else zoo_settings(algorithm, env.get_attr("spec")[0].id)
+    noise_std = settings.pop("noise_std", None)
+    if settings.pop("noise_type", None) == "normal":
+        import numpy as np
+        from stable_baselines3.common.noise import NormalActionNoise
+
+        n_actions = env.action_space.shape[0]
+        settings["action_noise"] = NormalActionNoise(np.zeros(n_actions), noise_std * np.ones(n_actions))
+    return class_of(algorithm)(**{"policy": "MlpPolicy", **settings, "env": env, "seed": seed, **arguments})
+
+
+def class_of(algorithm: str) -> Any:
+    """
+    :param algorithm: One of ``NAMES``
+    :return: Its class
+    """
+    import sb3_contrib
+    import stable_baselines3
+
+    from sb3_causalgdp import CausalGDP
+
+    own = {"causalgdp": CausalGDP, "tqc": sb3_contrib.TQC, "crossq": sb3_contrib.CrossQ}
+    return own.get(algorithm) or getattr(stable_baselines3, algorithm.upper())
+
+
+def zoo_settings(algorithm: str, env_id: str) -> dict[str, Any]:
+    """
+    :param algorithm: One of ``PEERS``
+    :param env_id: Of MuJoCo, version 5
+    :return: RL Zoo's settings for version 4 of it, or where RL Zoo has none those of all MuJoCo tasks
+    """
+    # Not imported, because it patches Gymnasium
+    spec = importlib.util.find_spec("rl_zoo3")
+    assert spec is not None and spec.origin is not None
+    path = Path(spec.origin).parent / "hyperparams" / f"{algorithm}.yml"
+    entries = yaml.safe_load(path.read_text(encoding="utf-8"))
+    entry = dict(entries.get(env_id.replace("-v5", "-v4")) or entries["HalfCheetah-v4"])
+    entry.pop("n_timesteps")
+    if isinstance(entry.get("policy_kwargs"), str):
+        entry["policy_kwargs"] = eval(entry["policy_kwargs"], {"dict": dict})
+    return entry
