@@ -5,10 +5,11 @@ Learning curves of CausalGDP beside other algorithms: the same environments, see
     python benchmarks/learning/run.py --env Hopper-v5 --name wide --kwargs '{"policy_kwargs": {"net_arch": [512, 512]}}'
     python benchmarks/learning/run.py --queue benchmarks/learning/queue.txt
 
-CausalGDP runs with its defaults, the others with RL Zoo's settings. Each run is a process of its own with one torch thread. Its
-CSV in ``benchmarks/learning/results/`` grows with each evaluation. A run that was interrupted goes on from its newest checkpoint
-in ``benchmarks/learning/checkpoints/``; one that is complete is not run again, unless it is asked for with more steps. A queue
-is a file with the arguments of one call in each line; it is read anew after each run, and several processes can work on it.
+CausalGDP runs with its defaults, the others with RL Zoo's settings. Each run is a process of its own with one torch thread.
+Its CSV in ``benchmarks/learning/results/`` grows with each evaluation. A run that was interrupted goes on from its newest
+checkpoint in ``benchmarks/learning/checkpoints/``; one that is complete is not run again, unless it is asked for with more
+steps. A queue is a file with the arguments of one call in each line; it is read anew after each run, and several processes can
+work on it.
 ``summary.py`` draws the results and prints their statistics.
 """
 
@@ -66,6 +67,18 @@ def last_timestep(path: Path) -> float:
     return float(lines[-1].split(",")[0]) if len(lines) > 1 else 0.0
 
 
+class Clock:
+    """Of this process: no part of a checkpoint."""
+
+    def __init__(self) -> None:
+        self.before = (time.perf_counter(), time.process_time())
+
+    def elapsed(self) -> tuple[float, float]:
+        """Wall-clock and CPU seconds since the last time."""
+        before, self.before = self.before, (time.perf_counter(), time.process_time())
+        return self.before[0] - before[0], self.before[1] - before[1]
+
+
 # One run ------------------------------------------------------------------------------------------------------------------
 
 
@@ -91,24 +104,18 @@ def train(run: Run) -> None:
             self.env = make_vec_env(run.env, n_envs=run.episodes)
             self.rows: list[tuple[float, ...]] = []
             self.spent = (0.0, 0.0)
-            self._clock: tuple[float, float] | None = None
+            self._clock = Clock()
 
         def _on_rollout_start(self) -> None:
-            now = (time.perf_counter(), time.process_time())
-            if self._clock is not None:
-                wall, cpu = (spent + end - start for spent, end, start in zip(self.spent, now, self._clock, strict=True))
-                self.spent = (wall, cpu)
-            self._clock = now
-
-        def _on_training_start(self) -> None:
-            self._clock = None
+            wall, cpu = self._clock.elapsed()
+            self.spent = (self.spent[0] + wall, self.spent[1] + cpu)
 
         def _on_step(self) -> bool:
             if self.num_timesteps % run.eval_freq == 0:
                 self._on_rollout_start()
                 self._evaluate()
                 # Evaluations do not count
-                self._clock = (time.perf_counter(), time.process_time())
+                self._clock.elapsed()
             return True
 
         def _evaluate(self) -> None:
