@@ -83,7 +83,7 @@ def errors_of(path: Any, what: str = "cannot be read") -> Iterator[None]:
         raise
     except Exception as error:
         name, text = named(path), one_line(error)
-        raise ValueError(text if name in text else f"{name} {what}: {text}") from error
+        raise ValueError(text if text.startswith(name) else f"{name} {what}: {text}") from error
 
 
 def checked_entries(archive: zipfile.ZipFile, size: int, small: int = SMALL) -> list[zipfile.ZipInfo]:
@@ -121,6 +121,18 @@ def check_sums(archive: zipfile.ZipFile, entries: Iterable[zipfile.ZipInfo]) -> 
                 pass
 
 
+@contextmanager
+def opened(path: Any) -> Iterator[Any]:
+    """
+    :param path: A path, or a file-like object, which stays open
+    """
+    if isinstance(path, str | os.PathLike):
+        with open(path, "rb") as file:
+            yield file
+    else:
+        yield path
+
+
 def size_of(file: BinaryIO) -> int:
     """
     :param file: An open file
@@ -141,16 +153,13 @@ def read_arrays(file: Any, names: Iterable[str] | None = None) -> dict[str, np.n
     :return: The arrays
     :raises ValueError: If something is wrong with them
     """
-    if isinstance(file, str | os.PathLike):
-        with open(file, "rb") as opened:
-            return read_arrays(opened, names)
     arrays = {}
-    with zipfile.ZipFile(file) as archive:
-        for entry in checked_entries(archive, size_of(file)):
+    with opened(file) as stream, zipfile.ZipFile(stream) as archive:
+        for entry in checked_entries(archive, size_of(stream)):
             name = entry.filename.removesuffix(".npy")
             if names is None or name in names:
-                with archive.open(entry) as opened:
-                    arrays[name] = _read_array(opened, entry.file_size, name)
+                with archive.open(entry) as content:
+                    arrays[name] = _read_array(content, entry.file_size, name)
     return arrays
 
 

@@ -23,7 +23,7 @@ BIT_GENERATORS = {
     kind.__name__: kind
     for kind in (np.random.PCG64, np.random.PCG64DXSM, np.random.MT19937, np.random.Philox, np.random.SFC64)
 }
-SEQUENCES: dict[str, Callable[[list], Any]] = {"list": list, "tuple": tuple, "set": set, "frozenset": frozenset}
+SEQUENCES: dict[str, Callable[[list], Any]] = {"tuple": tuple, "set": set, "frozenset": frozenset}
 ARRAY_KINDS = "biufcSUMm"  # no objects
 DEEPEST = 60
 LONGEST_NUMBER = 5_000
@@ -96,6 +96,8 @@ class Writer:
             return self._array(value)
         if isinstance(value, np.generic):
             return {"scalar": self._array(np.asarray(value))}
+        if kind is list:
+            return [self._encode(one, depth + 1) for one in value]
         return self._container(value, depth + 1) or self._object(value, depth + 1)
 
     def _array(self, value: np.ndarray) -> dict[str, Any]:
@@ -111,8 +113,6 @@ class Writer:
 
     def _container(self, value: Any, depth: int) -> Any:
         kind = type(value)
-        if kind is list:
-            return [self._encode(one, depth) for one in value]
         if kind.__name__ in SEQUENCES and kind is SEQUENCES[kind.__name__]:
             return {kind.__name__: [self._encode(one, depth) for one in value]}
         if kind is deque:
@@ -133,11 +133,15 @@ class Writer:
             if value.kind not in ARRAY_KINDS:
                 raise NotPlainError(f"the dtype {value}")
             return {"dtype": value.str}
+        if kind is slice:
+            return {"slice": [self._encode(one, depth) for one in (value.start, value.stop, value.step)]}
         if isinstance(value, np.random.Generator) and type(value.bit_generator).__name__ in BIT_GENERATORS:
             return {"generator": self._encode(value.bit_generator.state, depth)}
         if kind is np.random.RandomState:
             return {"random_state": self._encode(value.get_state(legacy=False), depth)}
         if isinstance(value, type):
+            if issubclass(value, np.generic) and np.dtype(value).kind in ARRAY_KINDS and np.dtype(value).type is value:
+                return {"numpy_type": np.dtype(value).str}
             if self.known.named.get(name_of(value)) is value:
                 return {"class": name_of(value)}
             raise NotPlainError(f"the class {name_of(value)}")
@@ -215,6 +219,12 @@ class Reader:
             raise ValueError(f"it holds the dtype {dtype}")
         return dtype
 
+    def _numpy_type(self, value: dict) -> type:
+        return self._dtype({"dtype": value["numpy_type"]}).type
+
+    def _slice(self, value: dict) -> slice:
+        return slice(*(self._decode(one) for one in value["slice"]))
+
     def _bytes(self, value: dict) -> bytes:
         return base64.b64decode(value["bytes"], validate=True)
 
@@ -273,7 +283,7 @@ class Reader:
 _KINDS = frozenset(
     {
         *("array", "scalar", "dtype", "bytes", "deque", "dict", "ordered", "generator", "random_state"),
-        *("class", "enum", "object"),
+        *("class", "enum", "object", "numpy_type", "slice"),
     }
 )
 

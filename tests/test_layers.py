@@ -16,9 +16,9 @@ LAYERS = [
     {"losses", "gradients", "diagnostics", "structural", "device_replay", "cuda_graphs", "files"},
     {"product_pass"},
     {"policies"},
-    {"acting"},
+    {"acting", "saved"},
     {"causal", "offline", "diffusion"},
-    {"checks", "files", "products", "activations"},
+    {"checks", "files", "products", "activations", "plain", "archives"},
 ]
 WITHOUT_SB3 = {"causal", "diffusion", "losses", "gradients", "products", "product_pass", "activations", "cuda_graphs"}
 LEVELS = {part: level for level, parts in enumerate(LAYERS) for part in parts}

@@ -1,6 +1,7 @@
 """All that a training is, written in one piece and put back: for any of SB3's off-policy algorithms."""
 
 import copy
+import inspect
 import io
 import random
 import uuid
@@ -241,7 +242,9 @@ def resume(
     """
     with open_checkpoint(Path(path)) as checkpoint:
         with checkpoint.read(MODEL) as file:
-            model = algorithm.load(io.BytesIO(file.read()), env=env, device=device, force_reset=False)
+            # SB3's own algorithms trust every file
+            trust = {"trusted": trusted} if "trusted" in inspect.signature(algorithm.load).parameters else {}
+            model = algorithm.load(io.BytesIO(file.read()), env=env, device=device, force_reset=False, **trust)
         _check(model, checkpoint)
         own = bookkeeping_of(model)
         own.run = checkpoint.manifest["run"]
