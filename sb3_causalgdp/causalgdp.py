@@ -868,8 +868,10 @@ class CausalGDP(OfflineToOnlineAlgorithm):
             self._fed_offline_position = self.offline_buffer.size()
         return self
 
-    def load_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
-        super().load_replay_buffer(path, truncate_last_traj)
+    def load_replay_buffer(
+        self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True, *, trusted: bool = False
+    ) -> None:
+        super().load_replay_buffer(path, truncate_last_traj, trusted=trusted)
         self._fed_offline_position = 0
         if self.offline_buffer is not None and all(mark in self._fed_marks for mark in self._offline_marks):
             self._fed_offline_position = self.offline_buffer.size()

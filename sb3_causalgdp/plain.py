@@ -5,7 +5,7 @@ import enum
 import json
 import math
 from collections import OrderedDict, deque
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -25,6 +25,7 @@ BIT_GENERATORS = {
 }
 SEQUENCES: dict[str, Callable[[list], Any]] = {"tuple": tuple, "set": set, "frozenset": frozenset}
 ARRAY_KINDS = "biufcSUMm"  # no objects
+FORMAT = 1
 DEEPEST = 60
 LONGEST_NUMBER = 5_000
 
@@ -286,6 +287,33 @@ _KINDS = frozenset(
         *("class", "enum", "object", "numpy_type", "slice"),
     }
 )
+
+
+def decoded(
+    content: Any, block: bytes, known: Known, given: Collection[str] = (), only: Collection[str] | None = None
+) -> dict[str, Any]:
+    """
+    :param content: What a writer encoded, ``{"format": 1, "attributes": {...}}``
+    :param block: Its bytes
+    :param known: Classes that it may name
+    :param given: Attributes that are not read
+    :param only: Attributes that are read, None for all
+    :return: The attributes by name
+    :raises ValueError: If one cannot be read, which is named
+    """
+    if not isinstance(content, dict) or not isinstance(content.get("attributes"), dict):
+        raise ValueError("its attributes are no JSON object")
+    if content.get("format") != FORMAT:
+        raise ValueError(f"it is of format {content.get('format')!r}, this version reads {FORMAT}")
+    reader, values = Reader(known, block), {}
+    for name, value in content["attributes"].items():
+        if name in given or (only is not None and name not in only):
+            continue
+        try:
+            values[name] = reader.decode(value)
+        except (ValueError, RecursionError) as error:
+            raise ValueError(f"{name} cannot be read: {error}") from error
+    return values
 
 
 def read_json(data: bytes | str) -> Any:

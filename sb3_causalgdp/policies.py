@@ -29,9 +29,9 @@ from sb3_causalgdp.checks import check_at_least_zero
 from sb3_causalgdp.diffusion import Guidance, GuidanceRule, MLPDenoiser, NoiseSchedule, sample
 from sb3_causalgdp.diffusion.samplers import bind, check_sampler
 from sb3_causalgdp.files import saved_when_done
-from sb3_causalgdp.plain import Known, read_json
+from sb3_causalgdp.plain import Known, decoded, read_json
 from sb3_causalgdp.products import make_layers_fast
-from sb3_causalgdp.saved import BLOCK, CONTENT, KNOWN, check_limits, check_tensor_file, decoded, plain_entries
+from sb3_causalgdp.saved import BLOCK, CONTENT, KNOWN, check_limits, check_tensor_file, plain_entries
 
 ACTIVATIONS: dict[str, type[nn.Module]] = {
     "mish": nn.Mish,
@@ -451,8 +451,9 @@ class CausalGDPPolicy(BasePolicy):
 
         :param path: File, or file-like object
         """
-        written, entries = plain_entries(self._get_constructor_parameters(), known_to_policies())
-        left = {name: value for name, value in self._get_constructor_parameters().items() if name not in written}
+        arguments = {**self._get_constructor_parameters(), "lr_schedule": None}
+        written, entries = plain_entries(arguments, known_to_policies())
+        left = {name: value for name, value in arguments.items() if name not in written}
         saved = {
             "state_dict": self.state_dict(),
             "data": left,

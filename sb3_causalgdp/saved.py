@@ -10,13 +10,11 @@ from typing import Any, BinaryIO
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common import torch_layers
-from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise, VectorizedActionNoise
 from stable_baselines3.common.save_util import is_json_serializable
 from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
 from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule, LinearSchedule
 from stable_baselines3.her.goal_selection_strategy import GoalSelectionStrategy
-from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from sb3_causalgdp.activations import FastMish
 from sb3_causalgdp.archives import TRUST, check_sums, checked_entries, size_of
@@ -28,13 +26,12 @@ from sb3_causalgdp.causal.moments import Moments, Spread, StreamingMoments
 from sb3_causalgdp.causal.recent_rows import RecentRows
 from sb3_causalgdp.causal.variables import TransitionVariables
 from sb3_causalgdp.offline.rewards import RewardTransform
-from sb3_causalgdp.plain import SPACES, Known, NotPlainError, Reader, Writer, read_json
+from sb3_causalgdp.offline.saved_buffers import BUFFERS
+from sb3_causalgdp.plain import FORMAT, SPACES, Known, NotPlainError, Writer, decoded, read_json
 
-FORMAT = 1
 CONTENT, BLOCK = "plain.json", "plain.bin"
 # What SB3's own load can do without: it is in the plain part alone
 LARGE = ("causal_statistics", "_causal_graph", "causal_graph_history")
-BUFFERS = (ReplayBuffer, DictReplayBuffer, NStepReplayBuffer, HerReplayBuffer)
 KNOWN = Known(
     filled=[
         *SPACES,
@@ -159,30 +156,6 @@ def read_plain(archive: zipfile.ZipFile, known: Known, given: Collection[str] = 
     if CONTENT not in archive.namelist():
         return {}
     return decoded(read_json(archive.read(CONTENT)), archive.read(BLOCK), known, given)
-
-
-def decoded(content: Any, block: bytes, known: Known, given: Collection[str] = ()) -> dict[str, Any]:
-    """
-    :param content: What :func:`plain_entries` wrote as JSON
-    :param block: Its bytes
-    :param known: Classes that it may name
-    :param given: Attributes that are not read
-    :return: The attributes by name
-    :raises ValueError: If one cannot be read, which is named
-    """
-    if not isinstance(content, dict) or not isinstance(content.get("attributes"), dict):
-        raise ValueError("its attributes are no JSON object")
-    if content.get("format") != FORMAT:
-        raise ValueError(f"it is of format {content.get('format')!r}, this version reads {FORMAT}")
-    reader, values = Reader(known, block), {}
-    for name, value in content["attributes"].items():
-        if name in given:
-            continue
-        try:
-            values[name] = reader.decode(value)
-        except (ValueError, RecursionError) as error:
-            raise ValueError(f"{name} cannot be read: {error}") from error
-    return values
 
 
 def _check_attributes(read: Mapping[str, Any], saved: Mapping[str, Any], plain: Mapping[str, Any], cls: type) -> None:

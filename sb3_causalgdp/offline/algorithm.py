@@ -1,6 +1,7 @@
 """From offline data to online learning, for any off-policy algorithm: preload, pretrain, and batches of both kinds."""
 
 import io
+import os
 import pathlib
 import time
 import warnings
@@ -18,11 +19,13 @@ from stable_baselines3.common.type_aliases import MaybeCallback, Schedule
 from stable_baselines3.common.utils import FloatSchedule, configure_logger
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
+from sb3_causalgdp.archives import existing
 from sb3_causalgdp.files import saved_when_done
 from sb3_causalgdp.offline.observations import flat_space
 from sb3_causalgdp.offline.preload import check_buffer, copy_rows, positions_needed, preload_buffer, spaces_of
 from sb3_causalgdp.offline.replay import SpacesEnv, can_sample
 from sb3_causalgdp.offline.rewards import RewardTransform, check_reward_transform
+from sb3_causalgdp.offline.saved_buffers import SUFFIXES, can_be_arrays, read_buffer, write_buffer
 from sb3_causalgdp.offline.sources import Source, open_source
 
 SelfAlgorithm = TypeVar("SelfAlgorithm", bound="OfflineToOnlineAlgorithm")
@@ -123,6 +126,7 @@ class OfflineToOnlineAlgorithm(OffPolicyAlgorithm):
         reward_transform: str | None = None,
         progress_bar: bool = False,
         download: bool = True,
+        trusted: bool = False,
     ) -> SelfAlgorithm:
         """
         Load recorded transitions into ``offline_buffer``: all of them, or none when something is wrong with them. Until
@@ -130,7 +134,7 @@ class OfflineToOnlineAlgorithm(OffPolicyAlgorithm):
         buffer of their own, and batches are made from both (``offline_fraction``). A second call adds to the first.
 
         Observations are flattened as the environment's ``FlattenObservation`` does, actions are scaled to [-1, 1], and a
-        training ``VecNormalize`` gets their statistics. Open your own files only: unpickling can execute code.
+        training ``VecNormalize`` gets their statistics.
 
         :param source: The id of a Minari dataset (``"D4RL/pointmaze/umaze-v2"``), a ``minari.MinariDataset``, a replay buffer
             of SB3 or the path of a saved one, or arrays: a mapping (or the path of an ``.npz`` file) of ``observations``,
@@ -138,9 +142,10 @@ class OfflineToOnlineAlgorithm(OffPolicyAlgorithm):
         :param reward_transform: What is done to the rewards, here and in ``learn()``; None takes the constructor's
         :param progress_bar: Whether to show a progress bar (needs tqdm)
         :param download: Whether to download a dataset that is not on this machine
+        :param trusted: Whether a pickled buffer may hold more than what SB3's own are made of, which could run code
         :return: The model
         """
-        data = open_source(source, download)
+        data = open_source(source, download, trusted)
         name = self.reward_transform if reward_transform is None else reward_transform
         if self._reward_transform is not None and name != self.reward_transform:
             raise ValueError(f"The model's rewards are transformed by {self.reward_transform!r} already, got {name!r}")
@@ -331,35 +336,52 @@ class OfflineToOnlineAlgorithm(OffPolicyAlgorithm):
 
     def save_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase) -> None:
         """
-        Save the replay buffer as a pickle file, and with it the preloaded transitions. A file is replaced only once the new
-        one is complete.
+        Save the replay buffer, and with it the preloaded transitions: the stored rows as arrays that need no pickle (``.npz``,
+        also where the name has no suffix: such a file can be given away), or with the suffix ``.pkl`` as SB3 does. Buffers of
+        your own classes need a pickle. A file is replaced only once the new one is complete.
 
         :param path: Path to the file where the replay buffer should be saved
+        :raises ValueError: If a buffer of your own class is to be saved as ``.npz``
         """
         assert self.replay_buffer is not None
+        is_path = isinstance(path, str | os.PathLike)
+        suffix = pathlib.Path(path).suffix if is_path else ""  # type: ignore[arg-type]
+        pickled = suffix == ".pkl"
+        if suffix == "" and not can_be_arrays(self.replay_buffer):
+            pickled = True
+            warnings.warn(f"{type(self.replay_buffer).__name__} is pickled: load_replay_buffer needs trusted=True to read it")
         self.replay_buffer.offline_part = (self.offline_buffer, self._offline_marks)  # type: ignore[attr-defined]
         try:
-            with saved_when_done(path, ".pkl") as file:
-                super().save_replay_buffer(file)
+            with saved_when_done(path, ".pkl" if pickled else ".npz") as file:
+                if pickled:
+                    super().save_replay_buffer(file)
+                else:
+                    write_buffer(self.replay_buffer, file)
         finally:
             del self.replay_buffer.offline_part  # type: ignore[attr-defined]
 
-    def load_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
+    def load_replay_buffer(
+        self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True, *, trusted: bool = False
+    ) -> None:
         """
-        Load a replay buffer from a pickle file, and the preloaded transitions that were saved with it.
+        Load a replay buffer, and the preloaded transitions that were saved with it. When it raises, the model has what it had.
 
-        :param path: Path to the pickled replay buffer
+        :param path: Path to the file, as ``.npz`` or pickled; without its suffix, the first of these that is there
         :param truncate_last_traj: See SB3's ``load_replay_buffer``, for ``HerReplayBuffer``
+        :param trusted: Whether a pickle may hold more than the replay buffers of SB3, which could run code
+        :raises ValueError: If the file is not whole, or not trusted and needs to be
         """
-        super().load_replay_buffer(path, truncate_last_traj)
-        assert self.replay_buffer is not None
-        self.offline_buffer, self._offline_marks = self.replay_buffer.__dict__.pop("offline_part", (None, []))
-        if self.offline_buffer is None:
-            return
-        self.offline_buffer.device = self.device
-        if isinstance(self.offline_buffer, HerReplayBuffer) and self.offline_buffer is not self.replay_buffer:
-            assert self.env is not None
-            self.offline_buffer.set_env(self.env)
+        buffer = read_buffer(existing(path, SUFFIXES) if isinstance(path, str | os.PathLike) else path, trusted)
+        offline, marks = vars(buffer).pop("offline_part", (None, []))
+        for one in {id(one): one for one in (buffer, offline) if one is not None}.values():
+            if isinstance(one, HerReplayBuffer):
+                assert self.env is not None, "You must pass an environment at load time when using `HerReplayBuffer`"
+                one.set_env(self.env)
+            # Update saved replay buffer device to match current setting, see GH#1561
+            one.device = self.device
+        if isinstance(buffer, HerReplayBuffer) and truncate_last_traj:
+            buffer.truncate_last_trajectory()
+        self.replay_buffer, self.offline_buffer, self._offline_marks = buffer, offline, marks
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "offline_buffer", "_offline_marks"]
