@@ -751,7 +751,9 @@ def _read_policy(file: BinaryIO, device: th.device, trusted: bool) -> tuple[dict
         except pickle.UnpicklingError as error:
             raise ValueError(f"it holds pickled objects, which could run code: {TRUST}") from error
     content = saved.get(CONTENT)
-    arguments = {} if content is None else decoded(read_json(content), saved[BLOCK].cpu().numpy().tobytes(), known_to_policies())
+    arguments = (
+        {} if content is None else decoded(read_json(content), saved[BLOCK].cpu().numpy().tobytes(), known_to_policies())
+    )
     arguments = {**saved["data"], **arguments}
     if not trusted:
         check_limits(arguments, size_of(file))

@@ -223,7 +223,9 @@ def check_limits(values: Mapping[str, Any], size: int) -> None:
 def _check_number(name: str, value: Any, limit: int) -> None:
     value = getattr(value, "frequency", value)
     if isinstance(value, int | float) and not isinstance(value, bool) and not value <= limit:
-        raise ValueError(f"{name} is {value:g}, the limit is {limit:,}: if you trust where the file is from, pass trusted=True")
+        raise ValueError(
+            f"{name} is {value:g}, the limit is {limit:,}: if you trust where the file is from, pass trusted=True"
+        )
 
 
 def _check_units(name: str, value: Any, size: int) -> None:
