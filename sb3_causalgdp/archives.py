@@ -47,6 +47,7 @@ OF_SB3: dict[str, set[str]] = {
 # Up to so many bytes no file is suspicious
 SMALL = 1 << 28
 MOST_TIMES = 100
+LONGEST_TEXT = 1_000
 COMPRESSIONS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA)
 TRUST = "if you trust where the file is from, pass trusted=True"
 
@@ -65,6 +66,7 @@ def one_line(error: BaseException) -> str:
     :return: What it says in one line, with its class where that is no plain ValueError
     """
     text = " ".join(str(error).split())
+    text = text if len(text) <= LONGEST_TEXT else f"{text[:LONGEST_TEXT]}..."
     return text if type(error) is ValueError and text else f"{type(error).__name__}: {text}".removesuffix(": ")
 
 

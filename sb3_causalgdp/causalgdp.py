@@ -944,8 +944,8 @@ class CausalGDP(OfflineToOnlineAlgorithm):
         **kwargs: Any,
     ) -> SelfCausalGDP:
         """
-        Load the model from a zip-file. ``load`` re-creates the model from scratch, it does not update it in-place: for that use
-        ``set_parameters``.
+        Load the model from a zip-file. ``load`` re-creates the model from scratch, it does not update it in-place: for that
+        use ``set_parameters``.
 
         Nothing that the file brings is run, and what asks for very large networks, buffers or numbers of steps is refused,
         unless it is trusted. It has to be where it holds what you brought yourself, such as a schedule that is a lambda, or is

@@ -5,6 +5,7 @@ import json
 import zipfile
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any, BinaryIO
 
 import torch as th
@@ -238,7 +239,7 @@ def _check_units(name: str, value: Any, size: int) -> None:
         for part in value:
             _check_units(name, part, size)
         units = [part for part in value if isinstance(part, int)]
-        n_weights = sum(one * other for one, other in zip(units, units[1:], strict=False))
+        n_weights = sum(one * other for one, other in pairwise(units))
         if 4 * n_weights > size:
             raise ValueError(f"{name} asks for {n_weights:,} weights, more than the file has")
     else:

@@ -36,8 +36,8 @@ def make_parser() -> argparse.ArgumentParser:
     add(
         "source",
         metavar="DATASET_OR_BUFFER",
-        help="id of a Minari dataset, a replay buffer from model.save_replay_buffer (.npz, .pkl), or an .npz file of the arrays "
-        "observations, actions, next_observations and rewards",
+        help="id of a Minari dataset, a replay buffer from model.save_replay_buffer (.npz, .pkl), or an .npz file of the "
+        "arrays observations, actions, next_observations and rewards",
     )
     add(
         "--method", default="partial_r2", help=f"discovery method, one of {', '.join(sorted(DISCOVERY_METHODS))} (%(default)s)"

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
-from sb3_causalgdp.archives import errors_of, existing, is_zip, read_arrays, read_pickle
+from sb3_causalgdp.archives import errors_of, existing, is_zip, one_line, read_arrays, read_pickle
 from sb3_causalgdp.causal.variables import TransitionVariables
 from sb3_causalgdp.plain import SPACES, Known, decoded, read_json
 
@@ -241,10 +241,17 @@ class MinariSource(TransitionSource):
         super().__init__(name, variables, int(dataset.total_steps), max_rows)
 
     def _parts(self, n_rows: int) -> Iterator[np.ndarray]:
-        for episode in self.dataset.iterate_episodes():
+        for episode in self._episodes():
             # T steps have T + 1 observations
             states = self._flat(episode.observations)
             yield self.variables.stack(states[:-1], _as_rows(np.asarray(episode.actions)), states[1:], episode.rewards)
+
+
+    def _episodes(self) -> Iterator[Any]:
+        try:
+            yield from self.dataset.iterate_episodes()
+        except Exception as error:  # h5py raises all kinds on files that are cut off or damaged
+            raise SourceError(f"{self.name} cannot be read, its file is damaged: {one_line(error)}") from error
 
 
 class ArraySource(TransitionSource):
@@ -367,5 +374,10 @@ def _open_minari(dataset_id: str, download: bool, max_rows: int | None) -> Trans
     except FileNotFoundError as error:
         raise SourceError(f"no Minari dataset {dataset_id!r} on this machine: ask for its download (--download)") from error
     except Exception as error:  # of the network, of a server's library, or of a broken file
-        raise SourceError(f"the Minari dataset {dataset_id!r} cannot be loaded: {error}") from error
-    return MinariSource(dataset, dataset_id, max_rows)
+        raise SourceError(f"the Minari dataset {dataset_id!r} cannot be loaded: {one_line(error)}") from error
+    try:
+        return MinariSource(dataset, dataset_id, max_rows)
+    except SourceError:
+        raise
+    except Exception as error:  # of damaged metadata
+        raise SourceError(f"the Minari dataset {dataset_id!r} cannot be read: {one_line(error)}") from error

@@ -139,15 +139,7 @@ def _one_buffer(arrays: dict[str, np.ndarray]) -> tuple[ReplayBuffer, dict[str, 
         raise ValueError("it says of no replay buffer what it is")
     content = decoded(read_json(arrays.pop(CONTENT).tobytes()), arrays.pop(BLOCK).tobytes(), KNOWN)
     buffer = _empty(content)
-    for name, value in vars(buffer).items():
-        if name in content:
-            if type(value) is not type(content[name]) and not (isinstance(value, float) and type(content[name]) is int):
-                raise ValueError(f"{name} must be of {type(value).__name__}, got {type(content[name]).__name__}")
-            if isinstance(value, np.ndarray) and value.shape != content[name].shape:
-                raise ValueError(f"{name} must have shape {value.shape}, got {content[name].shape}")
     vars(buffer).update({name: content[name] for name in vars(buffer) if name in content})
-    if not 0 <= buffer.pos < buffer.buffer_size:
-        raise ValueError(f"pos must be from 0 to {buffer.buffer_size - 1}, got {buffer.pos}")
     _fill(buffer, arrays)
     check_columns(buffer)
     return buffer, content
@@ -207,21 +199,51 @@ def _fill(buffer: ReplayBuffer, arrays: dict[str, np.ndarray]) -> None:
 
 def check_columns(buffer: ReplayBuffer) -> None:
     """
-    :param buffer: A replay buffer
-    :raises ValueError: If its arrays do not fit each other and its spaces, or a stored row is NaN or infinite
+    :param buffer: A replay buffer of one of SB3's classes
+    :raises ValueError: If its attributes do not fit each other and its spaces, or a stored row is NaN or infinite
     """
-    n_rows = _n_rows(buffer)
-    lead = (buffer.buffer_size, buffer.n_envs)
-    shapes = {"rewards": lead, "dones": lead, "timeouts": lead, "actions": (*lead, buffer.action_dim)}
-    space = buffer.observation_space
-    for name in ("observations", "next_observations"):
-        if isinstance(space, spaces.Dict):
-            shapes |= {f"{name}/{key}": (*lead, *buffer.obs_shape[key]) for key in space.spaces}  # type: ignore[call-overload,index]
-        else:
-            shapes[name] = (*lead, *buffer.obs_shape)  # type: ignore[misc]
-    for name, column in _columns(buffer):
-        if name in shapes and column.shape != shapes[name]:
-            raise ValueError(f"{name} must be of shape {shapes[name]}, got {column.shape}")
+    lacks = {"observation_space", "action_space", "n_envs", "buffer_size", "pos", "full"} - vars(buffer).keys()
+    if lacks:
+        raise ValueError(f"it lacks {sorted(lacks)}")
+    small = _small(buffer)
+    lacks = vars(small).keys() - vars(buffer).keys() - {"env"}
+    if lacks:
+        raise ValueError(f"it lacks {sorted(lacks)}")
+    for name, value in vars(small).items():
+        given = vars(buffer).get(name)
+        if name not in NOT_WRITTEN and type(given) is not type(value) and not {type(given), type(value)} <= {int, float}:
+            raise ValueError(f"{name} must be of {type(value).__name__}, got {type(given).__name__}")
+    columns = dict(_columns(buffer))
+    for name, column in _columns(small):
+        wanted = (buffer.buffer_size, *column.shape[1:])
+        there = columns.get(name)
+        if there is None or there.shape != wanted or there.dtype != column.dtype:
+            got = "none" if there is None else f"{there.shape} and {there.dtype}"
+            raise ValueError(f"{name} must be of shape {wanted} and {column.dtype}, got {got}")
+    if not 0 <= buffer.pos < buffer.buffer_size:
+        raise ValueError(f"pos must be from 0 to {buffer.buffer_size - 1}, got {buffer.pos}")
+    _check_finite(columns, _n_rows(buffer))
+
+
+def _small(buffer: ReplayBuffer) -> ReplayBuffer:
+    """One row of the same kind."""
+    kwargs: dict[str, Any] = {"env": None} if isinstance(buffer, HerReplayBuffer) else {}
+    if type(buffer) not in BUFFERS or type(buffer.n_envs) is not int or not 1 <= buffer.n_envs <= MOST_ROWS:
+        raise ValueError(f"it is of {type(buffer).__name__} for {buffer.n_envs} environments")
+    return type(buffer)(
+        buffer.n_envs,
+        buffer.observation_space,
+        buffer.action_space,
+        device="cpu",
+        n_envs=buffer.n_envs,
+        optimize_memory_usage=getattr(buffer, "optimize_memory_usage", False),
+        handle_timeout_termination=getattr(buffer, "handle_timeout_termination", False),
+        **kwargs,
+    )
+
+
+def _check_finite(columns: Mapping[str, np.ndarray], n_rows: int) -> None:
+    for name, column in columns.items():
         stored = column[:n_rows]
         # The sum is much faster, and finite where all are
         with np.errstate(over="ignore", invalid="ignore"):

@@ -11,7 +11,7 @@ import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
 
-from sb3_causalgdp.archives import errors_of, existing, read_arrays
+from sb3_causalgdp.archives import errors_of, existing, one_line, read_arrays
 from sb3_causalgdp.offline.extras import OFFLINE_HINT
 from sb3_causalgdp.offline.saved_buffers import SUFFIXES, is_buffer, read_buffer
 
@@ -125,9 +125,9 @@ class MinariSource(Source):
     def _episodes(self) -> Iterator[Any]:
         try:
             yield from self.dataset.iterate_episodes()
-        except (OSError, KeyError, RuntimeError) as error:  # what h5py raises on files that are cut off or damaged
+        except Exception as error:  # h5py raises all kinds on files that are cut off or damaged
             raise ValueError(
-                f"{self.name} cannot be read, its file is incomplete or damaged: {error}. Delete "
+                f"{self.name} cannot be read, its file is incomplete or damaged: {one_line(error)}. Delete "
                 f"{self.dataset.storage.data_path} and download it again"
             ) from error
 
@@ -268,9 +268,10 @@ def _open_minari(dataset_id: str, download: bool) -> Source:
     except Exception as error:  # of the network, of a server's library, or of a broken file
         raise ValueError(
             f"The Minari dataset {dataset_id!r} is not on this machine and cannot be downloaded, or its metadata are "
-            f"damaged: {type(error).__name__}: {error}"
+            f"damaged: {one_line(error)}"
         ) from error
-    return MinariSource(dataset)
+    with errors_of(dataset_id):
+        return MinariSource(dataset)
 
 
 def _as_arrays(values: Any) -> Any:

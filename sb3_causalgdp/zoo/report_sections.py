@@ -344,7 +344,7 @@ def _hyperparameter_section(run: RunFolder, model_path: Path) -> Section:
     else:
         rows = [(str(key), _text(value)) for key, value in sorted(run.entry.items())]
         tables.append(Table(("config.yml", ""), rows, "The entry of the YAML file, with what the command line's -params set:"))
-    saved = saved_attributes(model_path)
+    saved = saved_attributes(model_path, run.trusted)
     rows = []
     for name, parameter in constructor_arguments().items():
         value = getattr(saved.get("policy_class"), "__name__", "") if name == "policy" else _text(saved.get(name))

@@ -1,5 +1,6 @@
 """What RL Zoo left in the folder of a run."""
 
+import json
 import re
 import zipfile
 from collections.abc import Mapping
@@ -10,6 +11,8 @@ from typing import Any
 import numpy as np
 from stable_baselines3.common.monitor import LoadMonitorResultsError, load_results
 from stable_baselines3.common.results_plotter import X_TIMESTEPS, ts2xy
+
+from stable_baselines3.common.save_util import json_to_data
 
 from sb3_causalgdp import CausalGDP
 from sb3_causalgdp.archives import checked_entries, errors_of, opened, read_arrays, size_of
@@ -114,7 +117,7 @@ class RunFolder:
         :return: The causal graphs that the model at the end of the training holds, oldest first; empty without that model
         """
         final = self.models().get("final")
-        return [] if final is None else saved_attributes(final).get("causal_graph_history", [])
+        return [] if final is None else saved_attributes(final, self.trusted).get("causal_graph_history", [])
 
     def checkpoint_graphs(self) -> list[CausalGraph]:
         """
@@ -122,7 +125,7 @@ class RunFolder:
         """
         graphs: dict[int, CausalGraph] = {}
         for _, path in self.checkpoints():
-            graph = saved_attributes(path).get("_causal_graph")
+            graph = saved_attributes(path, self.trusted).get("_causal_graph")
             if graph is not None and graph.num_timesteps is not None:
                 graphs[graph.num_timesteps] = graph
         return [graphs[steps] for steps in sorted(graphs)]
@@ -152,15 +155,18 @@ class RunFolder:
             return Evaluations(arrays["timesteps"], arrays["results"])
 
 
-def saved_attributes(path: Path) -> dict[str, Any]:
+def saved_attributes(path: Path, trusted: bool = False) -> dict[str, Any]:
     """
     :param path: A saved model
+    :param trusted: Whether it may bring Python objects that could run code
     :return: The attributes of the model, without its networks; of those that need a pickle, their type as text
     :raises ValueError: If the file cannot be read
     """
     with errors_of(path), opened(path) as file, zipfile.ZipFile(file) as archive:
         checked_entries(archive, size_of(file))
         saved = read_json(archive.read("data"))
+        if trusted:
+            return {**json_to_data(json.dumps(saved)), **read_plain(archive, CausalGDP._known_classes())}
         left_out = {name: value[":type:"] for name, value in saved.items() if is_pickled(value) and name not in LARGE}
         known = {name: value for name, value in saved.items() if not is_pickled(value)}
         return {**known, **left_out, **read_plain(archive, CausalGDP._known_classes())}
