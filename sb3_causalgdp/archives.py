@@ -1,6 +1,7 @@
 """Zip archives, arrays and pickles of strangers: nothing is unpacked that is out of proportion, and nothing is run."""
 
 import io
+import json
 import os
 import pickle
 import zipfile
@@ -240,3 +241,32 @@ def existing(path: str | os.PathLike[str], suffixes: Iterable[str]) -> Path:
             if path.with_name(path.name + suffix).is_file():
                 return path.with_name(path.name + suffix)
     return path
+
+
+def load_minari(dataset_id: str, download: bool, trusted: bool = False) -> Any:
+    """
+    :param dataset_id: Of a Minari dataset
+    :param download: Whether to download it if it is not on this machine
+    :param trusted: Whether Minari may make the environment that its metadata describe, which runs what they name
+    :return: The ``minari.MinariDataset``
+    :raises ImportError: Without minari
+    :raises ValueError: If its metadata are out of proportion, or name an environment in place of spaces
+    """
+    import minari
+    from minari.storage import get_dataset_path
+
+    path = get_dataset_path(dataset_id) / "data" / "metadata.json"
+    if download and not path.parent.exists():
+        minari.download_dataset(dataset_id)
+    if path.is_file():
+        with errors_of(dataset_id):
+            metadata = json.loads(path.read_text(encoding="utf-8"))
+            size = sum(file.stat().st_size for file in path.parent.rglob("*") if file.is_file())
+            for name, most in {"total_episodes": size, "total_steps": MOST_TIMES * size}.items():
+                count = metadata.get(name, 0)
+                if isinstance(count, bool) or not isinstance(count, int) or not 0 <= count <= most:
+                    raise ValueError(f"{name} must be an integer from 0 to {most:,} for {size:,} bytes, got {str(count)[:80]}")
+            spaces = [isinstance(metadata.get(name), str) for name in ("observation_space", "action_space")]
+            if not trusted and not all(spaces):
+                raise ValueError(f"its metadata lack a space, and making its environment could run code: {TRUST}")
+    return minari.load_dataset(dataset_id, download=False)

@@ -268,6 +268,8 @@ class Reader:
             raise ValueError(f"{value['object']} has no attributes")
         instance = cls.__new__(cls)
         vars(instance).update({str(key): self._decode(one) for key, one in value["state"].items()})
+        if isinstance(instance, spaces.Space):
+            _check_space(instance)
         check = getattr(cls, "__post_init__", None)
         if check is not None:
             # What a dataclass checks of what it is made of, it checks of a file, too
@@ -279,6 +281,29 @@ class Reader:
         if not isinstance(name, str) or name not in classes:
             raise ValueError(f"it names {str(name)[:200]!r}, which is none of the classes that are known to be harmless")
         return classes[name]
+
+
+def _check_space(space: Any) -> None:
+    """Whether its attributes are those of a space that the constructor makes."""
+    cls = type(space)
+    arguments: dict[type, Callable[[], tuple[Any, ...]]] = {
+        spaces.Box: lambda: (space.low, space.high, space.low.shape, space.dtype.type),
+        spaces.Dict: lambda: (dict(space.spaces),),
+        spaces.Discrete: lambda: (space.n, None, space.start),
+        spaces.MultiBinary: lambda: (space.n,),
+        spaces.MultiDiscrete: lambda: (space.nvec, space.dtype.type, None, space.start),
+        spaces.Tuple: lambda: (tuple(space.spaces),),
+    }
+    fresh = cls(*arguments[cls]())
+    if vars(fresh).keys() != vars(space).keys() or fresh != space:
+        raise ValueError(f"the attributes of {cls.__name__} do not fit each other")
+    for name, value in vars(fresh).items():
+        given = vars(space)[name]
+        is_same = name in ("_np_random", "_np_random_seed") or type(given) is type(value)
+        if not is_same or (isinstance(value, np.ndarray) and (value.shape, value.dtype) != (given.shape, given.dtype)):
+            raise ValueError(f"{name} of {cls.__name__} does not fit its other attributes")
+    if not isinstance(space._np_random, np.random.Generator | None):
+        raise ValueError(f"the generator of {cls.__name__} is a {type(space._np_random).__name__}")
 
 
 _KINDS = frozenset(

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
-from sb3_causalgdp.archives import errors_of, existing, is_zip, one_line, read_arrays, read_pickle
+from sb3_causalgdp.archives import errors_of, existing, is_zip, load_minari, one_line, read_arrays, read_pickle
 from sb3_causalgdp.causal.variables import TransitionVariables
 from sb3_causalgdp.plain import SPACES, Known, decoded, read_json
 
@@ -324,7 +324,7 @@ def open_source(
             raise SourceError(str(error)) from error
     if path.suffix in SUFFIXES or not MINARI_ID.fullmatch(name):
         raise SourceError(f"no file {name!r}, and the id of a Minari dataset ends in -v and a number")
-    return _open_minari(name, download, max_rows)
+    return _open_minari(name, download, max_rows, trusted)
 
 
 def _open_file(path: Path, max_rows: int | None, trusted: bool) -> TransitionSource:
@@ -364,13 +364,13 @@ def _saved_buffer(arrays: dict[str, np.ndarray], prefix: str = "") -> Any:
     return buffer
 
 
-def _open_minari(dataset_id: str, download: bool, max_rows: int | None) -> TransitionSource:
+def _open_minari(dataset_id: str, download: bool, max_rows: int | None, trusted: bool) -> TransitionSource:
     try:
-        import minari
+        import minari  # noqa: F401
     except ImportError as error:
         raise SourceError(f"no file {dataset_id!r}, and a Minari dataset needs the package minari: {OFFLINE_HINT}") from error
     try:
-        dataset = minari.load_dataset(dataset_id, download=download)
+        dataset = load_minari(dataset_id, download, trusted)
     except FileNotFoundError as error:
         raise SourceError(f"no Minari dataset {dataset_id!r} on this machine: ask for its download (--download)") from error
     except Exception as error:  # of the network, of a server's library, or of a broken file

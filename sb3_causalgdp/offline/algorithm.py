@@ -19,7 +19,7 @@ from stable_baselines3.common.type_aliases import MaybeCallback, Schedule
 from stable_baselines3.common.utils import FloatSchedule, configure_logger
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
-from sb3_causalgdp.archives import existing
+from sb3_causalgdp.archives import errors_of, existing
 from sb3_causalgdp.files import saved_when_done
 from sb3_causalgdp.offline.observations import flat_space
 from sb3_causalgdp.offline.preload import check_buffer, copy_rows, positions_needed, preload_buffer, spaces_of
@@ -149,7 +149,8 @@ class OfflineToOnlineAlgorithm(OffPolicyAlgorithm):
         name = self.reward_transform if reward_transform is None else reward_transform
         if self._reward_transform is not None and name != self.reward_transform:
             raise ValueError(f"The model's rewards are transformed by {self.reward_transform!r} already, got {name!r}")
-        buffer = self._buffer_with_room(data)
+        with errors_of(data.name, "cannot be loaded"):
+            buffer = self._buffer_with_room(data)
         transform = name if self._reward_transform is None else self._reward_transform
         done = preload_buffer(buffer, data, self.env, self._vec_normalize_env, transform, progress_bar)
         if self.replay_buffer is self.offline_buffer or self._replay_buffer_is_empty():

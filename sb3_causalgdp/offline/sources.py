@@ -11,7 +11,7 @@ import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
 
-from sb3_causalgdp.archives import errors_of, existing, one_line, read_arrays
+from sb3_causalgdp.archives import errors_of, existing, load_minari, one_line, read_arrays
 from sb3_causalgdp.offline.extras import OFFLINE_HINT
 from sb3_causalgdp.offline.saved_buffers import SUFFIXES, is_buffer, read_buffer
 
@@ -243,7 +243,7 @@ def _open_name(name: str, download: bool, trusted: bool) -> Source:
         return _open_file(path, trusted)
     if path.suffix in SUFFIXES or not MINARI_ID.fullmatch(name):
         raise FileNotFoundError(f"There is no file {name!r}, and the id of a Minari dataset ends in -v and a number")
-    return _open_minari(name, download)
+    return _open_minari(name, download, trusted)
 
 
 def _open_file(path: Path, trusted: bool) -> Source:
@@ -254,13 +254,13 @@ def _open_file(path: Path, trusted: bool) -> Source:
     return BufferSource(read_buffer(path, trusted), str(path))
 
 
-def _open_minari(dataset_id: str, download: bool) -> Source:
+def _open_minari(dataset_id: str, download: bool, trusted: bool) -> Source:
     try:
-        import minari
+        import minari  # noqa: F401
     except ImportError as error:
         raise ImportError(f"The Minari dataset {dataset_id!r} needs the package minari: {OFFLINE_HINT}") from error
     try:
-        dataset = minari.load_dataset(dataset_id, download=download)
+        dataset = load_minari(dataset_id, download, trusted)
     except FileNotFoundError as error:
         raise FileNotFoundError(f"The Minari dataset {dataset_id!r} is not on this machine: {error}") from error
     except ImportError as error:
