@@ -2,9 +2,12 @@
 
 import io
 import json
+import math
 import os
 import pickle
+import struct
 import zipfile
+import zlib
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -106,6 +109,8 @@ def checked_entries(archive: zipfile.ZipFile, size: int, small: int = SMALL) -> 
     for entry in entries:
         if entry.flag_bits & 0x1 or entry.compress_type not in COMPRESSIONS:
             raise ValueError(f"the entry {entry.filename!r} is encrypted or compressed in an unknown way")
+        if entry.compress_type == zipfile.ZIP_STORED and entry.file_size != entry.compress_size:
+            raise ValueError(f"the entry {entry.filename!r} has two sizes")
     unpacked = sum(entry.file_size for entry in entries)
     if unpacked > max(small, MOST_TIMES * size):
         raise ValueError(f"{size:,} bytes would become {unpacked:,}, more than {MOST_TIMES} times as many")
@@ -162,35 +167,55 @@ def read_arrays(file: Any, names: Iterable[str] | None = None) -> dict[str, np.n
             name = entry.filename.removesuffix(".npy")
             if names is None or name in names:
                 with archive.open(entry) as content:
-                    arrays[name] = _read_array(content, entry.file_size, name)
+                    arrays[name] = _read_array(content, entry, name, stream)
     return arrays
 
 
-def _read_array(file: Any, n_bytes: int, name: str) -> np.ndarray:
-    version = np.lib.format.read_magic(file)
+def write_arrays(file: Any, arrays: Mapping[str, np.ndarray]) -> None:
+    """
+    What ``numpy.savez`` writes, without its copies.
+
+    :param file: Path or file-like object
+    :param arrays: By name, none of Python objects
+    """
+    with zipfile.ZipFile(file, "w") as archive:
+        for name, values in arrays.items():
+            values = np.asarray(values, order="C")
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as content:
+                np.lib.format.write_array_header_1_0(content, np.lib.format.header_data_from_array_1_0(values))
+                content.write(values.reshape(-1).view(np.uint8).data)
+
+
+def _read_array(content: Any, entry: zipfile.ZipInfo, name: str, stream: BinaryIO) -> np.ndarray:
+    version = np.lib.format.read_magic(content)
     readers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
     if version not in readers:
         raise ValueError(f"the array {name!r} is of the unknown version {version}")
-    shape, in_fortran_order, dtype = readers[version](file)
+    shape, in_fortran_order, dtype = readers[version](content)
     if dtype.hasobject:
         raise ValueError(f"the array {name!r} holds Python objects, which could run code")
-    left = n_bytes - file.tell()
-    count = 1
-    for length in shape:
-        count *= length
-    if count * dtype.itemsize != left or count < 0:
+    left = entry.file_size - content.tell()
+    count = math.prod(shape)
+    if count < 0 or count * dtype.itemsize != left:
         raise ValueError(f"the array {name!r} of shape {shape} and {dtype} has {left} bytes")
     values = np.empty(count, dtype)
-    view = memoryview(values.view(np.uint8)) if count > 0 else memoryview(b"")
-    done = 0
-    while done < left:
-        n_read = file.readinto(view[done : done + (1 << 20)])
-        if n_read == 0:
-            raise ValueError(f"the array {name!r} ends too early")
-        done += n_read
-    # The checksum is compared at the end of the entry
-    file.read(1)
+    view = memoryview(values.view(np.uint8)) if left > 0 else memoryview(bytearray())
+    if entry.compress_type == zipfile.ZIP_STORED:
+        _read_stored(stream, entry, view)
+    else:
+        view[:] = content.read()
     return values.reshape(shape[::-1]).T if in_fortran_order else values.reshape(shape)
+
+
+def _read_stored(stream: BinaryIO, entry: zipfile.ZipInfo, view: memoryview) -> None:
+    """The last bytes of an entry, with its checksum, and without the copies that ``zipfile`` makes."""
+    stream.seek(entry.header_offset + 26)
+    start = entry.header_offset + 30 + sum(struct.unpack("<HH", stream.read(4)))
+    stream.seek(start)
+    checksum = zlib.crc32(stream.read(entry.file_size - len(view)))
+    n_read = stream.readinto(view) if len(view) > 0 else 0  # type: ignore[attr-defined]
+    if n_read != len(view) or zlib.crc32(view, checksum) != entry.CRC:
+        raise ValueError(f"{entry.filename!r} is not what was written")
 
 
 class _Unpickler(pickle.Unpickler):

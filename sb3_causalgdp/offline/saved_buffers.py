@@ -1,7 +1,6 @@
 """Replay buffers of SB3 in files: arrays that need no pickle, and what SB3 pickles."""
 
 import json
-import os
 import zipfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -13,7 +12,7 @@ from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer
 from stable_baselines3.her.goal_selection_strategy import GoalSelectionStrategy
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
-from sb3_causalgdp.archives import errors_of, is_zip, named, opened, read_arrays, read_pickle
+from sb3_causalgdp.archives import errors_of, is_zip, named, opened, read_arrays, read_pickle, write_arrays
 from sb3_causalgdp.plain import FORMAT, SPACES, Known, NotPlainError, Writer, decoded, read_json
 
 SUFFIXES = (".npz", ".pkl")
@@ -47,11 +46,7 @@ def write_buffer(buffer: ReplayBuffer, file: Any) -> None:
     arrays = _arrays_of(buffer, {"marks": list(marks), "is_offline": offline is buffer})
     if offline is not None and offline is not buffer:
         arrays |= {f"{OFFLINE}{name}": values for name, values in _arrays_of(offline, {}).items()}
-    if isinstance(file, str | os.PathLike):
-        with open(file, "wb") as stream:
-            np.savez(stream, allow_pickle=False, **arrays)
-    else:
-        np.savez(file, allow_pickle=False, **arrays)
+    write_arrays(file, arrays)
 
 
 def _arrays_of(buffer: ReplayBuffer, more: Mapping[str, Any]) -> dict[str, Any]:
