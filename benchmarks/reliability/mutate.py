@@ -67,7 +67,12 @@ def write_files(folder: Path) -> None:
     steps = [Episode(generator.normal(size=(21, 3)).astype(np.float32), actions[:20], rewards[:20])] * 3
     write_dataset("strange/data-v0", steps, "Pendulum-v1", folder / "minari")
     goals = CausalGDP(
-        "MultiInputPolicy", GoalEnv(), replay_buffer_class=HerReplayBuffer, buffer_size=100, learning_starts=1_000, device="cpu"
+        "MultiInputPolicy",
+        GoalEnv(),
+        replay_buffer_class=HerReplayBuffer,
+        buffer_size=100,
+        learning_starts=1_000,
+        device="cpu",
     )
     goals.learn(60).save_replay_buffer(folder / "her.npz")
 
@@ -76,7 +81,9 @@ def _model(**kwargs: Any) -> Any:
     from sb3_causalgdp import CausalGDP
 
     tiny = {"policy_kwargs": {"net_arch": [8], "world_model_net_arch": [8]}, "batch_size": 8, "diffusion_steps": 2}
-    return CausalGDP("MlpPolicy", "Pendulum-v1", **tiny, buffer_size=300, causal_refresh_freq=250, device="cpu", seed=0, **kwargs)
+    return CausalGDP(
+        "MlpPolicy", "Pendulum-v1", **tiny, buffer_size=300, causal_refresh_freq=250, device="cpu", seed=0, **kwargs
+    )
 
 
 # Damage -----------------------------------------------------------------------------------------------------------------

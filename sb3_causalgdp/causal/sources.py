@@ -246,7 +246,6 @@ class MinariSource(TransitionSource):
             states = self._flat(episode.observations)
             yield self.variables.stack(states[:-1], _as_rows(np.asarray(episode.actions)), states[1:], episode.rewards)
 
-
     def _episodes(self) -> Iterator[Any]:
         try:
             yield from self.dataset.iterate_episodes()
