@@ -33,7 +33,7 @@ from sb3_causalgdp.causal import (
 from sb3_causalgdp.causal.interventions import ActionRule
 from sb3_causalgdp.causal.world_model import MaskedWorldModel
 from sb3_causalgdp.checkpoints import TrainingCheckpointCallback, begin_training, resume, save_checkpoint
-from sb3_causalgdp.checkpoints.checkpoint import all_callbacks, bookkeeping_of, fresh_seed
+from sb3_causalgdp.checkpoints.checkpoint import all_callbacks, bookkeeping_of, end_last_episodes, fresh_seed
 from sb3_causalgdp.checks import check_at_least_zero, is_count
 from sb3_causalgdp.cuda_graphs import UpdateGraphs, why_not_recorded
 from sb3_causalgdp.device_replay import DeviceReplay
@@ -847,8 +847,18 @@ class CausalGDP(OfflineToOnlineAlgorithm):
             progress_bar=progress_bar,
         )
 
-    def _setup_learn(self, *args, **kwargs) -> tuple[int, BaseCallback]:
-        result = super()._setup_learn(*args, **kwargs)
+    def _setup_learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        reset_num_timesteps: bool = True,
+        *args,
+        **kwargs,
+    ) -> tuple[int, BaseCallback]:
+        if self.replay_buffer is not None and (reset_num_timesteps or self._last_obs is None):
+            # SB3 resets the environments
+            end_last_episodes(self.replay_buffer)
+        result = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, *args, **kwargs)
         self._check_finite(self._last_obs, "observation")
         return result
 

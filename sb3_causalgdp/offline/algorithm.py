@@ -338,11 +338,13 @@ class OfflineToOnlineAlgorithm(OffPolicyAlgorithm):
         """
         assert self.replay_buffer is not None
         self.replay_buffer.offline_part = (self.offline_buffer, self._offline_marks)  # type: ignore[attr-defined]
+        self.replay_buffer.saved_after = self.n_environment_steps  # type: ignore[attr-defined]
         try:
             with saved_when_done(path, ".pkl") as file:
                 super().save_replay_buffer(file)
         finally:
             del self.replay_buffer.offline_part  # type: ignore[attr-defined]
+            del self.replay_buffer.saved_after  # type: ignore[attr-defined]
 
     def load_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
         """
@@ -354,6 +356,12 @@ class OfflineToOnlineAlgorithm(OffPolicyAlgorithm):
         super().load_replay_buffer(path, truncate_last_traj)
         assert self.replay_buffer is not None
         self.offline_buffer, self._offline_marks = self.replay_buffer.__dict__.pop("offline_part", (None, []))
+        saved_after = self.replay_buffer.__dict__.pop("saved_after", self.num_timesteps)
+        if saved_after != self.num_timesteps:
+            warnings.warn(
+                f"The replay buffer was saved after {saved_after} steps, the model after {self.num_timesteps}: they are not "
+                "of one moment, which save_checkpoint() would be"
+            )
         if self.offline_buffer is None:
             return
         self.offline_buffer.device = self.device
