@@ -1,14 +1,31 @@
 """What each update minimises: one small function a loss, on tensors alone."""
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import torch as th
 import torch.nn.functional as F
 
 from sb3_causalgdp.causal.world_model import MaskedWorldModel
+from sb3_causalgdp.diffusion.bounds import bounded, outside
 from sb3_causalgdp.diffusion.guidance import Guidance, GuidanceRule, guidance_shift
 from sb3_causalgdp.diffusion.samplers import Denoiser, bind
 from sb3_causalgdp.diffusion.schedules import NoiseSchedule
+
+
+class DenoisingTerms(NamedTuple):
+    """
+    What one noise prediction is judged by.
+
+    :param loss: Mean over the batch and the action's components
+    :param clean_actions: Clipped to [-1, 1] with a gradient that leads back inside, shape ``(batch, d)``: one step stands for
+        the whole chain in the policy improvement of EDP (Kang et al., 2023, equation 9)
+    :param outside: Mean squared distance of the clean actions from their bounds before they are clipped
+    """
+
+    loss: th.Tensor
+    clean_actions: th.Tensor
+    outside: th.Tensor
 
 
 def td_target(
@@ -50,7 +67,7 @@ def denoising_loss(
     actions: th.Tensor,
     guidance: Guidance | None = None,
     rule: GuidanceRule | None = None,
-) -> tuple[th.Tensor, th.Tensor]:
+) -> DenoisingTerms:
     """
     ``E || eps_theta(a^k, k, s) - eps_cg ||^2``: the noise really injected, shifted by the guidance (stop-gradient).
 
@@ -60,19 +77,17 @@ def denoising_loss(
     :param actions: Clean actions, shape ``(batch, d)``
     :param guidance: What shifts the target, None for the plain denoising loss
     :param rule: How the guidance enters, needed with a guidance
-    :return: Mean over the batch and the action's components; and the clean actions that the same noise prediction gives,
-        clipped to [-1, 1], shape ``(batch, d)``: one step stands for the whole chain in the policy improvement of EDP (Kang
-        et al., 2023, equation 9)
+    :return: The loss, and what the same noise prediction says of the clean actions
     """
     step = th.randint(schedule.n_steps, (len(actions),), device=actions.device)
     noise = th.randn_like(actions)
     noisy = schedule.add_noise(actions, noise, step)
     predict_noise = bind(denoiser, features)
     predicted = predict_noise(noisy, step)
-    clean_action = schedule.clean_estimate(noisy, predicted, step).clamp(-1.0, 1.0)
+    clean_action = schedule.clean_estimate(noisy, predicted, step)
     if guidance is not None and rule is not None:
         noise = noise - guidance_shift(guidance, rule, predict_noise, schedule, noisy, predicted.detach(), step)
-    return F.mse_loss(predicted, noise), clean_action
+    return DenoisingTerms(F.mse_loss(predicted, noise), bounded(clean_action), outside(clean_action))
 
 
 def q_loss(values: th.Tensor, scale: th.Tensor) -> th.Tensor:
