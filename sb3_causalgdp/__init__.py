@@ -4,8 +4,17 @@ from pathlib import Path
 
 from sb3_causalgdp.callbacks import CausalWorldModelCallback
 from sb3_causalgdp.causalgdp import CausalGDP
+from sb3_causalgdp.divergence import TrainingDivergedError
 from sb3_causalgdp.policies import CnnPolicy, MlpPolicy, MultiInputPolicy
 
 __version__ = Path(__file__).with_name("version.txt").read_text(encoding="utf-8").strip()
 
-__all__ = ["CausalGDP", "CausalWorldModelCallback", "CnnPolicy", "MlpPolicy", "MultiInputPolicy", "__version__"]
+__all__ = [
+    "CausalGDP",
+    "CausalWorldModelCallback",
+    "CnnPolicy",
+    "MlpPolicy",
+    "MultiInputPolicy",
+    "TrainingDivergedError",
+    "__version__",
+]
