@@ -313,7 +313,7 @@ CONSTRUCTOR_ARGUMENTS: dict[str, Kind] = {
     "causal_discovery_kwargs": KEYWORDS | NONE,
     "causal_refresh_freq": STEPS,
     "causal_half_life": number(1.0, LARGEST_NUMBER) | NONE,
-    "causal_window": integer(2, MOST_STEPS) | NONE,
+    "causal_window": integer(8, MOST_STEPS) | NONE,
     "sample_masks": FLAG,
     "offline_dataset": PATH | NONE,
     "pretrain_steps": integer(0, MOST_PRETRAIN_STEPS),

@@ -43,11 +43,11 @@ from sb3_causalgdp.causal import (
 )
 from sb3_causalgdp.causal.graph import replaced_when_done
 from sb3_causalgdp.causal.interventions import ActionRule
-from sb3_causalgdp.causal.world_model import MaskedWorldModel
+from sb3_causalgdp.causal.world_model import MaskedWorldModel, unit_of
 from sb3_causalgdp.checks import first_not_finite_index, is_finite
 from sb3_causalgdp.cuda_graphs import UpdateGraphs, why_not_recorded
 from sb3_causalgdp.device_replay import DeviceReplay
-from sb3_causalgdp.divergence import TrainingDivergedError, check_optimizer_state, first_not_finite
+from sb3_causalgdp.divergence import ParametersError, TrainingDivergedError, check_optimizer_state, first_not_finite
 from sb3_causalgdp.gradients import Gradients, check_compile, compiled, gradients_of, without_checks
 from sb3_causalgdp.losses import critic_loss, denoising_loss, q_loss, quantile, td_target, world_model_loss
 from sb3_causalgdp.offline.algorithm import OfflineToOnlineAlgorithm, callback_list
@@ -257,6 +257,10 @@ class CausalGDP(OfflineToOnlineAlgorithm):
     ) -> None:
         # SB3 keeps them, and looks at them late or not at all
         check_arguments(CONSTRUCTOR_ARGUMENTS, locals())
+        if isinstance(policy, str) and policy not in self.policy_aliases:
+            raise ValueError(f"policy must be one of {list(self.policy_aliases)} or a class, got {policy!r}, which is unknown")
+        if env is None and _init_setup_model:
+            raise ValueError("env must be an id or an environment, got None: from_dataset() needs none")
         super().__init__(
             policy,
             env,
@@ -423,8 +427,8 @@ class CausalGDP(OfflineToOnlineAlgorithm):
                 raise ValueError(f"n_steps must be at most {n_positions}, buffer_size / n_envs, got {self.n_steps}")
         if self.optimize_memory_usage and n_positions < 2:
             raise ValueError(f"buffer_size must be at least 2 n_envs with optimize_memory_usage, got {self.buffer_size}")
-        if self.replay_buffer_class is not None:
-            check_keywords("replay_buffer_kwargs", self.replay_buffer_kwargs, self.replay_buffer_class)
+        if self.replay_buffer_class is not None or self.n_steps == 1:
+            check_keywords("replay_buffer_kwargs", self.replay_buffer_kwargs, self.replay_buffer_class or ReplayBuffer)
 
     def _own_policy_kwargs(self) -> dict[str, Any]:
         names = (
@@ -773,7 +777,7 @@ class CausalGDP(OfflineToOnlineAlgorithm):
         return {"critic_loss": loss}
 
     def _critic_gradients(self, replay_data, target: th.Tensor) -> tuple[th.Tensor, th.Tensor, Gradients]:
-        target_std = target.std(correction=0).clamp(min=1e-3)
+        target_std = unit_of(*th.std_mean(target, correction=0))
         loss = critic_loss(self.critic(replay_data.observations, replay_data.actions), target)
         return target_std, loss.detach(), gradients_of(self.critic, loss)
 
@@ -972,6 +976,7 @@ class CausalGDP(OfflineToOnlineAlgorithm):
         :param exact_match: Whether the parameters of each module, and each of their parameters, have to be there
         :param device: Device on which the code should run
         :raises ValueError: If one is NaN or infinite, unknown or missing, or an optimizer's state does not fit its parameters
+        :raises RuntimeError: If a network is another one
         """
         params = load_path_or_dict
         if not isinstance(params, dict):
@@ -980,8 +985,10 @@ class CausalGDP(OfflineToOnlineAlgorithm):
         self._check_parameters(params)
         try:
             super().set_parameters(params, exact_match, device)
-        except Exception:
+        except Exception as error:
             super().set_parameters(before)
+            if isinstance(error, ValueError):
+                raise ParametersError(f"Nothing was loaded: {error}") from error
             raise
         finally:
             # Optimizers have other tensors now
@@ -994,7 +1001,7 @@ class CausalGDP(OfflineToOnlineAlgorithm):
                 check_optimizer_state(owner, state, name)
             found = self.policy.first_not_finite(state) if owner is self.policy else first_not_finite(state, name)
             if found is not None:
-                raise ValueError(f"Nothing was loaded: {found[0]} holds {found[1]}, and all parameters have to be finite")
+                raise ParametersError(f"Nothing was loaded: {found[0]} holds {found[1]}, and all parameters have to be finite")
 
     def _refuse_to_save_nan(self) -> None:
         """

@@ -46,6 +46,13 @@ class TrainingDivergedError(ValueError):
         return type(self), (self.quantity, self.value, self.update)
 
 
+class ParametersError(ValueError, RuntimeError):
+    """
+    Parameters are not those of the model. As a ``RuntimeError`` it passes through SB3's ``load``, which takes other errors for
+    those of old files, and dies of a ``KeyError``.
+    """
+
+
 def first_not_finite(tree: Any, name: str = "", may_be_infinite: Iterable[str] = ()) -> tuple[str, float] | None:
     """
     :param tree: A tensor, a number, or dictionaries, lists and tuples of them
@@ -79,15 +86,17 @@ def check_optimizer_state(optimizer: th.optim.Optimizer, state: Mapping[str, Any
     :param optimizer: Of torch, else its states may have any shape
     :param state: What its ``load_state_dict`` is about to be given
     :param name: Its name
-    :raises ValueError: If the state is not one of as many parameters of these sizes
+    :raises ParametersError: If the state is not one of as many parameters of these sizes
     """
     groups, given = optimizer.param_groups, state.get("param_groups")
     values = state.get("state")
     if not isinstance(given, list) or not isinstance(values, Mapping):
-        raise ValueError(f"{name} must be the state of an optimizer, with 'state' and 'param_groups', got {list(state)}")
+        raise ParametersError(f"{name} must be the state of an optimizer, with 'state' and 'param_groups', got {list(state)}")
     sizes, given_sizes = ([len(group["params"]) for group in some] for some in (groups, given))
     if sizes != given_sizes:
-        raise ValueError(f"{name} has parameter groups of {sizes} parameters, and the given state is one of {given_sizes}")
+        raise ParametersError(
+            f"{name} has parameter groups of {sizes} parameters, and the given state is one of {given_sizes}"
+        )
     if not isinstance(optimizer, ELEMENTWISE):
         return
     parameters = [parameter for group in groups for parameter in group["params"]]
@@ -95,6 +104,6 @@ def check_optimizer_state(optimizer: th.optim.Optimizer, state: Mapping[str, Any
     for index, parameter in zip(indices, parameters, strict=True):
         for key, value in values.get(index, {}).items():
             if isinstance(value, th.Tensor) and key not in ("step", "eta", "mu") and value.shape != parameter.shape:
-                raise ValueError(
+                raise ParametersError(
                     f"{name}.state.{index}.{key} has the shape {tuple(value.shape)}, its parameter {tuple(parameter.shape)}"
                 )

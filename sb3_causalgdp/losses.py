@@ -83,7 +83,7 @@ def q_loss(values: th.Tensor, scale: th.Tensor) -> th.Tensor:
     :param scale: Q_j at the same actions, shape ``(batch, 1)``; no gradient flows through it
     :return: Scalar
     """
-    return -values.mean() / scale.detach().abs().mean().clamp(min=1e-6)
+    return -values.mean() / scale.detach().abs().mean().clamp(min=1e-20)
 
 
 def world_model_loss(

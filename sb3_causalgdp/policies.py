@@ -632,7 +632,7 @@ class CausalGDPPolicy(BasePolicy):
             if isinstance(values, np.ndarray) and not is_finite(values):
                 self._refuse_observation(values, key)
         actions, state = super().predict(observation, state, episode_start, deterministic)
-        if not is_finite(actions):
+        if not np.isfinite(actions).all():
             self._say_what_diverged(actions)
         return actions, state
 
@@ -647,7 +647,7 @@ class CausalGDPPolicy(BasePolicy):
 
     def _say_what_diverged(self, actions: np.ndarray) -> None:
         found = self.first_not_finite()
-        raise TrainingDivergedError(*(found or ("the policy's action", float(actions[first_not_finite_index(actions)]))))
+        raise TrainingDivergedError(*(found or ("the policy's action", float(actions[~np.isfinite(actions)][0]))))
 
     def forward(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         return self._predict(observation, deterministic=deterministic)

@@ -16,11 +16,21 @@ LAYERS = [
     {"losses", "gradients", "diagnostics", "structural", "device_replay", "cuda_graphs"},
     {"product_pass"},
     {"policies"},
-    {"acting"},
+    {"acting", "arguments"},
     {"causal", "offline", "diffusion"},
-    {"checks", "products", "activations"},
+    {"checks", "divergence", "products", "activations"},
 ]
-WITHOUT_SB3 = {"causal", "diffusion", "losses", "gradients", "products", "product_pass", "activations", "cuda_graphs"}
+WITHOUT_SB3 = {
+    "causal",
+    "diffusion",
+    "divergence",
+    "losses",
+    "gradients",
+    "products",
+    "product_pass",
+    "activations",
+    "cuda_graphs",
+}
 LEVELS = {part: level for level, parts in enumerate(LAYERS) for part in parts}
 FILES = sorted(PACKAGE.rglob("*.py"))
 

@@ -115,7 +115,7 @@ def test_td_targets_up_to_an_update_of_the_actor_are_computed_at_once(n_updates,
 @pytest.mark.parametrize("name", ["policy_delay", "world_model_delay"])
 @pytest.mark.parametrize("delay", [0, -1, 1.5, True, "2", None])
 def test_a_delay_that_is_no_number_of_gradient_steps_is_refused(name, delay):
-    with pytest.raises(ValueError, match=rf"{name} must be an integer of at least 1 gradient step, got"):
+    with pytest.raises(ValueError, match=rf"{name} must be an integer from 1 to [0-9,]+, got"):
         CausalGDP("MlpPolicy", "Pendulum-v1", **{name: delay})
 
 
@@ -186,7 +186,7 @@ def test_the_chain_judges_where_the_chain_ends():
 
 
 def test_an_unknown_actor_update_is_refused():
-    with pytest.raises(ValueError, match="Unknown actor_update"):
+    with pytest.raises(ValueError, match=r"actor_update must be one of \['chain', 'one_step'\], got 'two_step'"):
         CausalGDP("MlpPolicy", "Pendulum-v1", actor_update="two_step")
 
 
