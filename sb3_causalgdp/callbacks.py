@@ -167,12 +167,16 @@ class CausalWorldModelCallback(BaseCallback):
         return rows
 
     def _states(self, observations: np.ndarray | dict[str, np.ndarray], positions: np.ndarray) -> np.ndarray:
+        policy = self.model.policy
+        # Only networks have to be asked on their device; not all devices know double precision
+        device = self.model.device if policy.has_image_state else "cpu"
+
         def rows(values: np.ndarray) -> th.Tensor:
-            return th.as_tensor(values[positions].reshape(-1, *values.shape[2:]), device=self.model.device)
+            return th.as_tensor(values[positions].reshape(-1, *values.shape[2:]), device=device)
 
         if isinstance(observations, dict):
-            return self.model.policy.causal_state({key: rows(values) for key, values in observations.items()}).cpu().numpy()
-        return self.model.policy.causal_state(rows(observations)).cpu().numpy()
+            return policy.exact_causal_state({key: rows(values) for key, values in observations.items()}).cpu().numpy()
+        return policy.exact_causal_state(rows(observations)).cpu().numpy()
 
     def _draw_observations(self, buffer: ReplayBuffer) -> PyTorchObs:
         """A batch as the policy sees it, straight from the arrays: a HER buffer cannot sample before an episode has ended."""

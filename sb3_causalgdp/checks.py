@@ -1,7 +1,11 @@
-"""Checks of arguments that several classes take."""
+"""Checks of arguments and arrays that several classes make."""
 
 import math
 from typing import Any
+
+import numpy as np
+
+LARGEST_FLOAT32 = float(np.finfo(np.float32).max)
 
 
 def check_at_least_zero(**values: Any) -> None:
@@ -14,9 +18,20 @@ def check_at_least_zero(**values: Any) -> None:
             raise ValueError(f"{name} must be a finite number of at least 0, got {value!r}")
 
 
-def is_count(value: Any) -> bool:
+def is_finite(values: np.ndarray) -> bool:
     """
-    :param value: What was given for an argument
-    :return: Whether it is an integer of at least 1
+    :param values: Of any type and shape
+    :return: Whether all are finite, and stay so in float32
     """
-    return isinstance(value, int) and not isinstance(value, bool) and value >= 1
+    if values.dtype.kind != "f":
+        return True
+    fits = np.isfinite(values) if values.dtype.itemsize <= 4 else np.abs(values) <= LARGEST_FLOAT32
+    return bool(fits.all())
+
+
+def first_not_finite_index(values: np.ndarray) -> tuple[int, ...]:
+    """
+    :param values: Numbers that are not all finite in float32
+    :return: Index of the first that is not, one number for each axis, at least one
+    """
+    return tuple(np.argwhere(~(np.abs(np.atleast_1d(values)) <= LARGEST_FLOAT32))[0].tolist())

@@ -13,6 +13,12 @@ from sb3_causalgdp.diffusion.samplers import Denoiser, bind
 from sb3_causalgdp.diffusion.schedules import NoiseSchedule
 
 
+# So small that only zeros are smaller
+SMALLEST_SCALE = 1e-20
+# Of the level of Q: differences below are rounding
+SMALLEST_DIFFERENCE = 1e-5
+
+
 class DenoisingTerms(NamedTuple):
     """
     What one noise prediction is judged by.
@@ -90,15 +96,24 @@ def denoising_loss(
     return DenoisingTerms(F.mse_loss(predicted, noise), bounded(clean_action), outside(clean_action))
 
 
-def q_loss(values: th.Tensor, scale: th.Tensor) -> th.Tensor:
+def q_loss(values: th.Tensor, others: th.Tensor, of_data: th.Tensor | None = None) -> th.Tensor:
     """
-    ``-E[Q_i(s, G_theta(s; z))] / E|Q_j|``: one critic is climbed, another one sets the scale (Diffusion-QL).
+    ``-E[Q_i(s, G_theta(s; z))]`` over a scale: one critic is climbed, another one sets the scale.
+
+    Without ``of_data`` the scale is ``E|Q_j|`` (Diffusion-QL). It grows with the returns and with every reward that does not
+    depend on the action, and the Q term loses its weight. With ``of_data`` the scale is the mean of
+    ``|Q_j(s, G_theta(s; z)) - Q_j(s, a)|``: what the choice of the action makes a difference of.
 
     :param values: Q_i at the actor's actions, shape ``(batch, 1)``
-    :param scale: Q_j at the same actions, shape ``(batch, 1)``; no gradient flows through it
+    :param others: Q_j at the same actions, shape ``(batch, 1)``; no gradient flows through it
+    :param of_data: Q_j at the actions of the batch, shape ``(batch, 1)``; no gradient flows through it
     :return: Scalar
     """
-    return -values.mean() / scale.detach().abs().mean().clamp(min=1e-6)
+    level = others.detach().abs().mean()
+    if of_data is None:
+        return -values.mean() / level.clamp(min=SMALLEST_SCALE)
+    difference = (others - of_data).detach().abs().mean()
+    return -values.mean() / th.maximum(difference, SMALLEST_DIFFERENCE * level).clamp(min=SMALLEST_SCALE)
 
 
 def world_model_loss(

@@ -214,6 +214,7 @@ TAGS = {
     "guidance/step_size",
     "guidance/step_size_bound",
     "train/actor_loss",
+    "train/bound_loss",
     "train/critic_loss",
     "train/denoising_loss",
     "train/learning_rate",

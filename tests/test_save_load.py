@@ -212,6 +212,8 @@ ARGUMENTS = {
     "eta": 0.5,
     "denoising_weight": 0.7,
     "actor_update": "chain",
+    "q_scale": "value",
+    "bound_penalty": 0.2,
     "policy_delay": 3,
     "world_model_delay": 4,
     "max_q_backup": True,

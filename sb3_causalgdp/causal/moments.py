@@ -6,7 +6,8 @@ import numpy.typing as npt
 import torch as th
 
 LARGEST_VALUE = 1e140  # so that the sum of squares stays inside float64
-CONSTANT_FLOOR = 1e-10  # a million times float64's rounding, yet below a sensor at 1e6 with sd 1e-3
+CONSTANT_SHARE = 1e-10  # of the mean: a million times float64's rounding, yet below a sensor at 1e6 with sd 1e-3
+CONSTANT_FLOOR = 1e-12  # what rounding leaves of numbers around 1 that cancel, yet below rewards in units of 1e-9
 FIRST_BLOCK_ROWS = 8  # so that a jackknife has blocks to leave out from the first graph on
 MANY_ROWS = 128  # from where half of a product costs more time than another matrix of its size
 FORGOTTEN = 1e-9  # weight of a block, relative to that of the newest batch, that says nothing any more
@@ -34,8 +35,8 @@ class Spread:
 
     @property
     def constant(self) -> np.ndarray:
-        """Which columns do not move: standard deviation at most 1e-10 max(1, \\|mean\\|), boolean, shape (p,)."""
-        return self.standard_deviation() <= CONSTANT_FLOOR * np.maximum(1.0, np.abs(self.mean))
+        """Which columns do not move: standard deviation at most 1e-10 \\|mean\\| or 1e-12, boolean, shape (p,)."""
+        return self.standard_deviation() <= np.maximum(CONSTANT_FLOOR, CONSTANT_SHARE * np.abs(self.mean))
 
 
 @dataclass(frozen=True, eq=False)
@@ -355,7 +356,7 @@ class StreamingMoments:
 
     @property
     def constant(self) -> np.ndarray:
-        """Which columns do not move: standard deviation at most 1e-10 max(1, \\|mean\\|), boolean, shape (p,)."""
+        """Which columns do not move: standard deviation at most 1e-10 \\|mean\\| or 1e-12, boolean, shape (p,)."""
         return self.spread().constant
 
     def correlation(self) -> np.ndarray:

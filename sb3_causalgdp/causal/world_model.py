@@ -10,6 +10,10 @@ from sb3_causalgdp.activations import tanh_
 from sb3_causalgdp.products import linear
 
 
+SMALLEST_STD = 1e-12
+ROUNDINGS = 8.0 * th.finfo(th.float32).eps
+
+
 class MaskedBlocks(nn.Module):
     """
     One small multi-layer perceptron per output, evaluated for all outputs at once.
@@ -124,6 +128,19 @@ def _mean(values: th.Tensor, known: th.Tensor | None) -> th.Tensor:
     if known is None:
         return values.mean(dim=0)
     return known @ values / known.sum().clamp(min=1.0)
+
+
+def unit_of(std: th.Tensor, mean: th.Tensor) -> th.Tensor:
+    """
+    The unit in which a variable is measured: its standard deviation. What does not move has the unit 1, because a quotient by
+    rounding would say nothing and could be of any size; and what moves by less than 1e-12 counts as that, because squares of
+    its noise would leave float32.
+
+    :param std: Standard deviations in float32
+    :param mean: Means, of the same shape
+    :return: Positive, of the same shape
+    """
+    return th.where(std > SMALLEST_STD + ROUNDINGS * mean.abs(), std, 1.0)
 
 
 def _drawn(mask: th.Tensor) -> th.Tensor:
@@ -304,24 +321,27 @@ class MaskedWorldModel(nn.Module):
 
     @property
     def state_std(self) -> th.Tensor:
-        """Running standard deviation of the states, shape ``(n,)``."""
-        return self.state_variance.sqrt().clamp(min=1e-4)
+        """Running standard deviation of the states, 1 for those that do not move, shape ``(n,)``."""
+        return unit_of(self.state_variance.sqrt(), self.state_mean)
 
     @property
     def reward_scale(self) -> th.Tensor:
-        """Running standard deviation of the rewards, shape ``()``."""
-        return self.reward_variance.sqrt().clamp(min=1e-4)
+        """Running standard deviation of the rewards, 1 if they do not move, shape ``()``."""
+        return unit_of(self.reward_variance.sqrt(), self.reward_mean)
 
     @property
     def residual_std(self) -> th.Tensor:
         """Standard deviation of what the residual path leaves, ``s'_j - C_ss[j, j] s_j``, standardised, shape ``(n,)``."""
+        return self._residual_std(self.state_std)
+
+    def _residual_std(self, state_std: th.Tensor) -> th.Tensor:
         gate = self.state_to_state.diagonal()
-        change = (self.change_variance / self.state_std.square()).clamp(max=4.0)
+        change = (self.change_variance / state_std.square()).clamp(max=4.0)
         # With equal variances of s and s': var(s' - c s) = (1 - c)^2 + c var(s' - s)
         return ((1.0 - gate).square() + gate * change).sqrt().clamp(min=1e-4)
 
-    def _network_input(self, state: th.Tensor, action: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
-        standardised = (state - self.state_mean) / self.state_std
+    def _network_input(self, state: th.Tensor, action: th.Tensor, state_std: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        standardised = (state - self.state_mean) / state_std
         return standardised, th.cat([standardised.clamp(-self.INPUT_BOUND, self.INPUT_BOUND), action], dim=1)
 
     def _transition_mask(self) -> th.Tensor:
@@ -342,12 +362,13 @@ class MaskedWorldModel(nn.Module):
         return self._next_state(state, action, self._transition_mask())
 
     def _next_state(self, state: th.Tensor, action: th.Tensor, mask: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
-        standardised, inputs = self._network_input(state, action)
-        residual_std = self.residual_std
+        state_std = self.state_std
+        standardised, inputs = self._network_input(state, action, state_std)
+        residual_std = self._residual_std(state_std)
         change = residual_std * self.transition(inputs, mask)
         mean = self.state_to_state.diagonal() * standardised + change
-        std = self._bounded(self.transition_log_std).exp() * residual_std * self.state_std
-        return self.state_mean + self.state_std * mean, std
+        std = self._bounded(self.transition_log_std).exp() * residual_std * state_std
+        return self.state_mean + state_std * mean, std
 
     def predict_reward(self, next_state: th.Tensor, action: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """
@@ -358,9 +379,9 @@ class MaskedWorldModel(nn.Module):
         return self._reward(next_state, action, self._reward_mask())
 
     def _reward(self, next_state: th.Tensor, action: th.Tensor, mask: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
-        _, inputs = self._network_input(next_state, action)
-        mean = self.reward(inputs, mask).squeeze(1)
-        return self.reward_mean + self.reward_scale * mean, self._bounded(self.reward_log_std).exp() * self.reward_scale
+        _, inputs = self._network_input(next_state, action, self.state_std)
+        mean, scale = self.reward(inputs, mask).squeeze(1), self.reward_scale
+        return self.reward_mean + scale * mean, self._bounded(self.reward_log_std).exp() * scale
 
     def negative_log_likelihood(
         self,
@@ -401,8 +422,9 @@ class MaskedWorldModel(nn.Module):
         :param action: a in [-1, 1], shape ``(batch, d)``
         :return: See :class:`ActionResponse`
         """
-        standardised, inputs = self._network_input(state, action)
-        residual_std, state_std = self.residual_std, self.state_std
+        state_std, reward_scale = self.state_std, self.reward_scale
+        standardised, inputs = self._network_input(state, action, state_std)
+        residual_std = self._residual_std(state_std)
         actions = slice(self.state_dim, None)
         noise_std = self._bounded(self.transition_log_std).exp()
         # In standard deviations from the start: Humanoid's Jacobians fill megabytes, and each pass over them takes time
@@ -412,7 +434,7 @@ class MaskedWorldModel(nn.Module):
         next_standardised = self.state_to_state.diagonal() * standardised + residual_std * change
         reward_inputs = th.cat([next_standardised.clamp(-self.INPUT_BOUND, self.INPUT_BOUND), action], dim=1)
         reward, reward_gradient = self.reward.forward_and_jacobian(
-            reward_inputs, self._reward_mask(), slice(None), self.reward_scale
+            reward_inputs, self._reward_mask(), slice(None), reward_scale
         )
         reward_gradient = reward_gradient.squeeze(1)
         by_next_state, by_action = reward_gradient[:, : self.state_dim], reward_gradient[:, self.state_dim :]
@@ -421,8 +443,8 @@ class MaskedWorldModel(nn.Module):
             next_state=self.state_mean + state_std * next_standardised,
             next_state_std=noise_std * residual_std * state_std,
             standardised_jacobian=jacobian,
-            reward=self.reward_mean + self.reward_scale * reward.squeeze(1),
-            reward_std=self._bounded(self.reward_log_std).exp() * self.reward_scale,
+            reward=self.reward_mean + reward_scale * reward.squeeze(1),
+            reward_std=self._bounded(self.reward_log_std).exp() * reward_scale,
             reward_by_next_state=by_next_state,
             reward_by_action=by_action,
         )

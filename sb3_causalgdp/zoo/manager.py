@@ -39,8 +39,6 @@ from sb3_causalgdp.zoo.scripts import replaced
 from sb3_causalgdp.zoo.search_space import sample_causalgdp_params
 from sb3_causalgdp.zoo.versions import installed_versions
 
-DIVERGENCE_CALLBACK = "sb3_causalgdp.zoo.callbacks.StopOnDivergence"
-
 
 class CausalGDPExperimentManager(ExperimentManager):
     """
@@ -138,8 +136,6 @@ class CausalGDPExperimentManager(ExperimentManager):
         # RL Zoo makes schedules of the learning rate alone, which cannot be loaded without it
         schedules = {key: make_schedule(key, hyperparams.pop(key)) for key in SCHEDULES if key in hyperparams}
         rest, env_wrapper, callbacks, vec_env_wrapper = super()._preprocess_hyperparams(hyperparams)
-        given = self.specified_callbacks or []
-        self.specified_callbacks = [*(given if isinstance(given, list) else [given]), DIVERGENCE_CALLBACK]
         return {**rest, **schedules}, env_wrapper, callbacks, vec_env_wrapper
 
     # Files ----------------------------------------------------------------------------------------------------------------
