@@ -21,7 +21,7 @@ from threadpoolctl import ThreadpoolController
 from torch import nn
 
 from sb3_causalgdp.activations import fast
-from sb3_causalgdp.causal.world_model import ROUNDINGS, SMALLEST_STD, MaskedBlocks, MaskedWorldModel
+from sb3_causalgdp.causal.world_model import MaskedBlocks, MaskedWorldModel
 from sb3_causalgdp.diffusion import GuidanceRule, MLPDenoiser, NoiseSchedule
 from sb3_causalgdp.diffusion.samplers import transition_weights
 
@@ -36,9 +36,7 @@ def _constant(value: float) -> np.ndarray:
 _ZERO, _ONE, _MINUS_ONE, _TWO = _constant(0.0), _constant(1.0), _constant(-1.0), _constant(2.0)
 _LARGEST_EXPONENT = _constant(20.0)
 _ROUNDING = _constant(8.0 * float(np.finfo(np.float32).eps))
-# Those of MaskedWorldModel
-_SMALLEST_STD, _ROUNDINGS = _constant(SMALLEST_STD), _constant(ROUNDINGS)
-_SMALLEST_RESIDUAL_STD, _MOST_CHANGE = _constant(1e-4), _constant(4.0)
+_SMALLEST_RESIDUAL_STD, _MOST_CHANGE = _constant(1e-4), _constant(4.0)  # those of MaskedWorldModel
 
 
 class Activation(NamedTuple):
@@ -378,8 +376,7 @@ class _WorldModel:
     def response(self, state: np.ndarray, action: np.ndarray) -> dict[str, np.ndarray]:
         arrays = self.arrays
         n_states = state.shape[1]
-        state_std = _unit_of(np.sqrt(arrays["state_variance"]), arrays["state_mean"])
-        reward_scale = _unit_of(np.sqrt(arrays["reward_variance"]), arrays["reward_mean"])
+        state_std, reward_scale = np.sqrt(arrays["state_unit_square"]), np.sqrt(arrays["reward_unit_square"])
         gate = arrays["state_to_state"].diagonal()
         closed = _ONE - gate
         change = np.minimum(arrays["change_variance"] / (state_std * state_std), _MOST_CHANGE)
@@ -407,7 +404,7 @@ class _WorldModel:
     def reward_distribution(self, standardised: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Means and standard deviation in the environment's units, from the standardised means."""
         arrays = self.arrays
-        scale = _unit_of(np.sqrt(arrays["reward_variance"]), arrays["reward_mean"])
+        scale = np.sqrt(arrays["reward_unit_square"])
         std = np.exp(arrays["reward_log_std"].clip(*self.log_std_bounds)) * scale
         return arrays["reward_mean"] + scale * standardised, std
 
@@ -450,10 +447,6 @@ class _Rule:
             slope_of, offset_of = list(slopes[:, 0]), list(offsets[:, 0])
             return lambda clean, step: offset_of[step] - slope_of[step].dot(clean)
         return lambda clean, step: (offsets[step] - slopes[step] @ clean.T[:, :, None])[:, :, 0].T
-
-
-def _unit_of(std: np.ndarray, mean: np.ndarray) -> np.ndarray:
-    return np.where(std > _SMALLEST_STD + _ROUNDINGS * np.abs(mean), std, _ONE)
 
 
 def _unit(rows: np.ndarray) -> np.ndarray:

@@ -1,7 +1,6 @@
 """What the arguments of the algorithm and of its policy accept: one table each."""
 
 import inspect
-import numbers
 import os
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
@@ -93,7 +92,7 @@ def integer(low: int, high: int) -> Kind:
     """
 
     def condition(value: Any) -> bool:
-        return isinstance(value, numbers.Integral) and not isinstance(value, bool) and low <= value <= high
+        return isinstance(value, (int, np.integer)) and not isinstance(value, bool) and bool(low <= value <= high)
 
     return _accepts(f"an integer from {_text(low)} to {_text(high)}", condition, int)
 
@@ -107,9 +106,9 @@ def number(low: float, high: float, above: bool = False) -> Kind:
     """
 
     def condition(value: Any) -> bool:
-        if not isinstance(value, numbers.Real) or isinstance(value, bool):
+        if not isinstance(value, (int, float, np.integer, np.floating)) or isinstance(value, bool):
             return False
-        return (low < value if above else low <= value) and value <= high
+        return bool((low < value if above else low <= value) and value <= high)
 
     return _accepts(
         f"a number above {_text(low)} and at most {_text(high)}" if above else f"a number from {_text(low)} to {_text(high)}",
@@ -205,11 +204,11 @@ def _read_train_freq(value: Any) -> Any:
     else:
         return STEPS.read(value)
     try:
-        unit = TrainFrequencyUnit(unit).value
+        name = TrainFrequencyUnit(unit).value
     except ValueError as error:
         raise NotAcceptedError from error
     steps = STEPS.read(frequency)
-    return value if isinstance(value, TrainFreq) else (steps, unit)
+    return value if isinstance(value, TrainFreq) else (steps, name)
 
 
 def counts_episodes(train_freq: Any) -> bool:

@@ -42,10 +42,10 @@ from sb3_causalgdp.causal import (
     make_statistics,
 )
 from sb3_causalgdp.causal.interventions import ActionRule
-from sb3_causalgdp.causal.world_model import MaskedWorldModel, unit_of
+from sb3_causalgdp.causal.world_model import MaskedWorldModel, moves
 from sb3_causalgdp.checkpoints import TrainingCheckpointCallback, begin_training, resume, save_checkpoint
 from sb3_causalgdp.checkpoints.checkpoint import all_callbacks, bookkeeping_of, end_last_episodes, fresh_seed
-from sb3_causalgdp.checks import first_not_finite_index, is_finite
+from sb3_causalgdp.checks import first_not_finite_index, fits_float32, is_finite
 from sb3_causalgdp.cuda_graphs import UpdateGraphs, why_not_recorded
 from sb3_causalgdp.device_replay import DeviceReplay
 from sb3_causalgdp.divergence import ParametersError, TrainingDivergedError, check_optimizer_state, first_not_finite
@@ -795,7 +795,8 @@ class CausalGDP(OfflineToOnlineAlgorithm):
         return {"critic_loss": loss}
 
     def _critic_gradients(self, replay_data, target: th.Tensor) -> tuple[th.Tensor, th.Tensor, Gradients]:
-        target_std = unit_of(*th.std_mean(target, correction=0))
+        target_std, target_mean = th.std_mean(target, correction=0)
+        target_std = th.where(moves(target_std, target_mean), target_std, 1.0)
         loss = critic_loss(self.critic(replay_data.observations, replay_data.actions), target)
         return target_std, loss.detach(), gradients_of(self.critic, loss)
 
@@ -946,34 +947,13 @@ class CausalGDP(OfflineToOnlineAlgorithm):
         if self.offline_buffer is not None and all(mark in self._fed_marks for mark in self._offline_marks):
             self._fed_offline_position = self.offline_buffer.size()
 
-    def predict(
-        self,
-        observation: np.ndarray | dict[str, np.ndarray],
-        state: tuple[np.ndarray, ...] | None = None,
-        episode_start: np.ndarray | None = None,
-        deterministic: bool = False,
-    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
-        """
-        SB3's ``predict``, which gives no action that is not a number: see
-        :meth:`~sb3_causalgdp.policies.CausalGDPPolicy.predict`.
-
-        :param observation: One observation or a batch
-        :param state: Not used
-        :param episode_start: Not used
-        :param deterministic: Whether the action has no noise
-        :return: The action of each, in the environment's units, and ``state``
-        :raises ValueError: If an observation is NaN or infinite
-        :raises TrainingDivergedError: If the policy itself gives NaN
-        """
-        try:
-            return super().predict(observation, state, episode_start, deterministic)
-        except TrainingDivergedError as error:
-            raise TrainingDivergedError(error.quantity, error.value, self._n_updates) from None
-
     def _sample_action(
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
     ) -> tuple[np.ndarray, np.ndarray]:
-        action, buffer_action = super()._sample_action(learning_starts, action_noise, n_envs)
+        try:
+            action, buffer_action = super()._sample_action(learning_starts, action_noise, n_envs)
+        except TrainingDivergedError as error:
+            raise TrainingDivergedError(error.quantity, error.value, self._n_updates) from None
         if not is_finite(buffer_action):
             # The policy's own actions are looked at in predict()
             raise ValueError(f"action_noise gave an action of NaN at step {self.num_timesteps}: {action_noise}")
@@ -995,12 +975,12 @@ class CausalGDP(OfflineToOnlineAlgorithm):
         if isinstance(values, dict):
             for key, part in values.items():
                 self._check_finite(part, f"{name}[{key!r}]")
-        elif not is_finite(np.asarray(values)):
+        elif not fits_float32(np.asarray(values)):
             values = np.atleast_1d(values)
             where = first_not_finite_index(values)
-            kind = "NaN or infinite" if not np.isfinite(values[where]) else "infinite (in float32)"
+            what = f"{name} that is infinite in float32" if np.isfinite(values[where]) else f"NaN or infinite {name}"
             raise ValueError(
-                f"The environment returned a {kind} {name} at step {self.num_timesteps}, index {list(where)}: "
+                f"The environment returned a {what} at step {self.num_timesteps}, index {list(where)}: "
                 f"{values[where]}. Nothing of this step was stored; see VecCheckNan to find its origin."
             )
 
@@ -1022,7 +1002,7 @@ class CausalGDP(OfflineToOnlineAlgorithm):
         try:
             super().set_parameters(params, exact_match, device)
         except Exception as error:
-            super().set_parameters(before)
+            super().set_parameters(before)  # type: ignore[arg-type]
             if isinstance(error, ValueError):
                 raise ParametersError(f"Nothing was loaded: {error}") from error
             raise

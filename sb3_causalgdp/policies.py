@@ -24,7 +24,7 @@ from sb3_causalgdp.activations import fast
 from sb3_causalgdp.arguments import POLICY_ARGUMENTS, check_arguments, check_keywords
 from sb3_causalgdp.causal import CausalGuidance, LinearisedGuidance, MaskedWorldModel, ReturnTarget, RewardTarget
 from sb3_causalgdp.causal.guidance import OutcomeTarget
-from sb3_causalgdp.checks import first_not_finite_index, is_finite
+from sb3_causalgdp.checks import first_not_finite_index, fits_float32, is_finite
 from sb3_causalgdp.diffusion import Guidance, GuidanceRule, MLPDenoiser, NoiseSchedule, sample
 from sb3_causalgdp.diffusion.samplers import bind, check_sampler
 from sb3_causalgdp.divergence import TrainingDivergedError, first_not_finite
@@ -636,17 +636,22 @@ class CausalGDPPolicy(BasePolicy):
         :raises ValueError: If an observation is NaN or infinite in float32, with its row and index
         :raises TrainingDivergedError: If the policy itself gives NaN, with the first of its tensors that holds it
         """
-        for key, values in observation.items() if isinstance(observation, dict) else ((None, observation),):
-            if isinstance(values, list):
-                values = np.asarray(values)
-            if isinstance(values, np.ndarray) and not is_finite(values):
-                self._refuse_observation(values, key)
+        if isinstance(observation, np.ndarray):
+            if not fits_float32(observation):
+                self._refuse_observation(observation)
+        else:
+            self._check_parts(observation)
         actions, state = super().predict(observation, state, episode_start, deterministic)
-        if not np.isfinite(actions).all():
+        if not is_finite(actions):
             self._say_what_diverged(actions)
         return actions, state
 
-    def _refuse_observation(self, values: np.ndarray, key: str | None) -> None:
+    def _check_parts(self, observation: Any) -> None:
+        for key, values in observation.items() if isinstance(observation, dict) else ((None, observation),):
+            if isinstance(values, (list, np.ndarray)) and not fits_float32(np.asarray(values)):
+                self._refuse_observation(np.asarray(values), key)
+
+    def _refuse_observation(self, values: np.ndarray, key: str | None = None) -> None:
         space = self.observation_space if key is None else self.observation_space[key]  # type: ignore[index]
         index = first_not_finite_index(values)
         value = np.atleast_1d(values)[index]

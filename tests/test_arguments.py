@@ -216,10 +216,10 @@ class WithActions(PendulumEnv):
     ("space", "message"),
     [
         (spaces.Box(1.0, 1.0, (1,)), "component 0 from 1 to 1 is fixed"),
-        (spaces.Box(np.float32([-1, 3]), np.float32([1, 3])), "component 1 from 3 to 3 is fixed"),
+        (spaces.Box(np.array([-1, 3], np.float32), np.array([1, 3], np.float32)), "component 1 from 3 to 3 is fixed"),
         (spaces.Box(-LARGEST, LARGEST, (1,)), r"from -3.40282e\+38 to 3.40282e\+38 cannot be told from \[-1, 1\] in float32"),
         (spaces.Box(-SMALLEST, SMALLEST, (1,)), "cannot be told"),
-        (spaces.Box(np.float32([1e8]), np.float32([1e8 + 16])), "cannot be told"),
+        (spaces.Box(1e8, 1e8 + 16, (1,)), "cannot be told"),
         (spaces.Box(-2, 2, (1,), np.int64), "float32 or float64"),
         (spaces.Box(-2, 2, (1,), np.float16), "float32 or float64"),
     ],
@@ -236,7 +236,7 @@ def test_actions_that_cannot_be_told_apart_are_refused_at_construction(space, me
         spaces.Box(-1e-30, 1e-30, (1,)),
         spaces.Box(-1e30, 1e30, (1,)),
         spaces.Box(-1e300, 1e300, (1,), np.float64),
-        spaces.Box(np.float64([1e9]), np.float64([1e9 + 1e-2]), dtype=np.float64),
+        spaces.Box(1e9, 1e9 + 1e-2, (1,), np.float64),
     ],
     ids=str,
 )

@@ -1,7 +1,7 @@
 """Gaussian models of the next state and of the reward, each output of which sees only what causes it."""
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch as th
 from torch import nn
@@ -130,17 +130,16 @@ def _mean(values: th.Tensor, known: th.Tensor | None) -> th.Tensor:
     return known @ values / known.sum().clamp(min=1.0)
 
 
-def unit_of(std: th.Tensor, mean: th.Tensor) -> th.Tensor:
+def moves(std: th.Tensor, mean: th.Tensor) -> th.Tensor:
     """
-    The unit in which a variable is measured: its standard deviation. What does not move has the unit 1, because a quotient by
-    rounding would say nothing and could be of any size; and what moves by less than 1e-12 counts as that, because squares of
-    its noise would leave float32.
+    Whether a variable moves by more than rounding. What does not is measured in units of 1: a quotient by rounding says
+    nothing and is of any size. What moves by less than 1e-12 counts as that: squares of its noise would leave float32.
 
     :param std: Standard deviations in float32
     :param mean: Means, of the same shape
-    :return: Positive, of the same shape
+    :return: Boolean, of the same shape
     """
-    return th.where(std > SMALLEST_STD + ROUNDINGS * mean.abs(), std, 1.0)
+    return std > SMALLEST_STD + ROUNDINGS * mean.abs()
 
 
 def _drawn(mask: th.Tensor) -> th.Tensor:
@@ -227,6 +226,10 @@ class MaskedWorldModel(nn.Module):
     change_variance: th.Tensor
     reward_mean: th.Tensor
     reward_variance: th.Tensor
+    state_unit_square: th.Tensor
+    """Running variance of the states, 1 for those that do not move, shape ``(n,)``."""
+    reward_unit_square: th.Tensor
+    """Running variance of the rewards, 1 if they do not move, shape ``()``."""
 
     def __init__(self, state_dim: int, action_dim: int, net_arch: list[int] | None = None) -> None:
         super().__init__()
@@ -257,6 +260,9 @@ class MaskedWorldModel(nn.Module):
         }
         for name, value in buffers.items():
             self.register_buffer(name, value)
+        # They follow from the others: once for an update, not each time that they are needed
+        self.register_buffer("state_unit_square", th.ones(state_dim), persistent=False)
+        self.register_buffer("reward_unit_square", th.ones(()), persistent=False)
 
     def set_masks(
         self,
@@ -289,6 +295,18 @@ class MaskedWorldModel(nn.Module):
         for name, mask in masks.items():
             getattr(self, name).copy_(mask)
 
+    def _set_units(self) -> None:
+        for square, variance, mean in (
+            (self.state_unit_square, self.state_variance, self.state_mean),
+            (self.reward_unit_square, self.reward_variance, self.reward_mean),
+        ):
+            square.copy_(th.where(moves(variance.sqrt(), mean), variance, 1.0))
+
+    def _load_from_state_dict(self, *args: Any, **kwargs: Any) -> None:
+        super()._load_from_state_dict(*args, **kwargs)
+        with th.no_grad():
+            self._set_units()
+
     @th.no_grad()
     def update_statistics(
         self, state: th.Tensor, next_state: th.Tensor, reward: th.Tensor, known: th.Tensor | None = None
@@ -316,32 +334,30 @@ class MaskedWorldModel(nn.Module):
             spread = _mean((values - batch_mean).square(), known)
             variance.lerp_(spread + (1.0 - weight) * difference.square(), weight)
             mean.lerp_(batch_mean, weight)
+        self._set_units()
         # About 0, not about its mean: the residual path leaves the mean change to the network
         self.change_variance.lerp_(_mean((next_state - state).square(), known), weight)
 
     @property
     def state_std(self) -> th.Tensor:
-        """Running standard deviation of the states, 1 for those that do not move, shape ``(n,)``."""
-        return unit_of(self.state_variance.sqrt(), self.state_mean)
+        """Unit of the states: their running standard deviation, 1 for those that do not move, shape ``(n,)``."""
+        return self.state_unit_square.sqrt()
 
     @property
     def reward_scale(self) -> th.Tensor:
-        """Running standard deviation of the rewards, 1 if they do not move, shape ``()``."""
-        return unit_of(self.reward_variance.sqrt(), self.reward_mean)
+        """Unit of the rewards: their running standard deviation, 1 if they do not move, shape ``()``."""
+        return self.reward_unit_square.sqrt()
 
     @property
     def residual_std(self) -> th.Tensor:
         """Standard deviation of what the residual path leaves, ``s'_j - C_ss[j, j] s_j``, standardised, shape ``(n,)``."""
-        return self._residual_std(self.state_std)
-
-    def _residual_std(self, state_std: th.Tensor) -> th.Tensor:
         gate = self.state_to_state.diagonal()
-        change = (self.change_variance / state_std.square()).clamp(max=4.0)
+        change = (self.change_variance / self.state_std.square()).clamp(max=4.0)
         # With equal variances of s and s': var(s' - c s) = (1 - c)^2 + c var(s' - s)
         return ((1.0 - gate).square() + gate * change).sqrt().clamp(min=1e-4)
 
-    def _network_input(self, state: th.Tensor, action: th.Tensor, state_std: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
-        standardised = (state - self.state_mean) / state_std
+    def _network_input(self, state: th.Tensor, action: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        standardised = (state - self.state_mean) / self.state_std
         return standardised, th.cat([standardised.clamp(-self.INPUT_BOUND, self.INPUT_BOUND), action], dim=1)
 
     def _transition_mask(self) -> th.Tensor:
@@ -363,8 +379,8 @@ class MaskedWorldModel(nn.Module):
 
     def _next_state(self, state: th.Tensor, action: th.Tensor, mask: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         state_std = self.state_std
-        standardised, inputs = self._network_input(state, action, state_std)
-        residual_std = self._residual_std(state_std)
+        standardised, inputs = self._network_input(state, action)
+        residual_std = self.residual_std
         change = residual_std * self.transition(inputs, mask)
         mean = self.state_to_state.diagonal() * standardised + change
         std = self._bounded(self.transition_log_std).exp() * residual_std * state_std
@@ -379,7 +395,7 @@ class MaskedWorldModel(nn.Module):
         return self._reward(next_state, action, self._reward_mask())
 
     def _reward(self, next_state: th.Tensor, action: th.Tensor, mask: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
-        _, inputs = self._network_input(next_state, action, self.state_std)
+        _, inputs = self._network_input(next_state, action)
         mean, scale = self.reward(inputs, mask).squeeze(1), self.reward_scale
         return self.reward_mean + scale * mean, self._bounded(self.reward_log_std).exp() * scale
 
@@ -423,8 +439,8 @@ class MaskedWorldModel(nn.Module):
         :return: See :class:`ActionResponse`
         """
         state_std, reward_scale = self.state_std, self.reward_scale
-        standardised, inputs = self._network_input(state, action, state_std)
-        residual_std = self._residual_std(state_std)
+        standardised, inputs = self._network_input(state, action)
+        residual_std = self.residual_std
         actions = slice(self.state_dim, None)
         noise_std = self._bounded(self.transition_log_std).exp()
         # In standard deviations from the start: Humanoid's Jacobians fill megabytes, and each pass over them takes time
