@@ -135,7 +135,8 @@ def choice(names: Iterable[str]) -> Kind:
     :return: One of these
     """
     known = sorted(names)
-    return _accepts(f"one of {known}", lambda value: isinstance(value, str) and value in known)
+    accepted = repr(known[0]) if len(known) == 1 else f"one of {known}"
+    return _accepts(accepted, lambda value: isinstance(value, str) and value in known)
 
 
 def subclass(of: type, words: str) -> Kind:
