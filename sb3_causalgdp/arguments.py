@@ -1,5 +1,6 @@
 """What the arguments of the algorithm and of its policy accept: one table each."""
 
+import difflib
 import inspect
 import os
 from collections.abc import Callable, Iterable, Mapping
@@ -135,7 +136,8 @@ def choice(names: Iterable[str]) -> Kind:
     :return: One of these
     """
     known = sorted(names)
-    return _accepts(f"one of {known}", lambda value: isinstance(value, str) and value in known)
+    accepted = repr(known[0]) if len(known) == 1 else f"one of {known}"
+    return _accepts(accepted, lambda value: isinstance(value, str) and value in known)
 
 
 def subclass(of: type, words: str) -> Kind:
@@ -389,7 +391,7 @@ def check_keywords(name: str, keywords: Iterable[str], function: Callable[..., A
     :param name: The argument that holds them
     :param keywords: Names of arguments
     :param function: A function or class that will be called with them
-    :raises TypeError: If it does not know one, with those that it knows
+    :raises TypeError: If it does not know one, with the one that may be meant, or those that it knows
     """
     parameters = inspect.signature(function).parameters.values()
     if any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters):
@@ -397,7 +399,9 @@ def check_keywords(name: str, keywords: Iterable[str], function: Callable[..., A
     known = [parameter.name for parameter in parameters]
     unknown = [keyword for keyword in keywords if keyword not in known]
     if unknown:
-        raise TypeError(f"{name}: {getattr(function, '__name__', function)} has no argument {unknown[0]!r}, but {known}")
+        close = difflib.get_close_matches(unknown[0], known, n=1)
+        hint = f"did you mean {close[0]!r}?" if close else f"it has {known}"
+        raise TypeError(f"{name}: {getattr(function, '__name__', function)} has no argument {unknown[0]!r}, {hint}")
 
 
 def check_action_space(space: spaces.Space) -> None:

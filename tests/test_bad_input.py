@@ -131,7 +131,9 @@ def test_what_overflows_float32_is_not_stored(value, fault, dtype, normalised):
 
 def test_large_numbers_that_float32_holds_are_stored():
     model = make(DoubleEnv("observation", 1e30))
-    model.learn(8)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        model.learn(8)
     assert np.abs(model.replay_buffer.next_observations).max() == 1e30
 
 
