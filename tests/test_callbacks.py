@@ -186,7 +186,7 @@ def test_an_own_discovery_method_sees_moments_and_the_last_graph_and_its_masks_a
 def test_a_window_that_is_too_short_for_the_discovery_is_refused_at_construction():
     with pytest.raises(ValueError, match="window=8 and half_life=None keep as few as 8 rows, and discovery needs 12"):
         make(causal_window=8)
-    with pytest.raises(ValueError, match="half_life=5.0 keep as few as 8 rows"):
+    with pytest.raises(ValueError, match=r"half_life=5\.0 keep as few as 8 rows"):
         make(causal_half_life=5.0)
     make(causal_window=16).learn(128, callback=RecordingCallback())
 
