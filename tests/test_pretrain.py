@@ -13,6 +13,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_causalgdp import CausalGDP, CausalWorldModelCallback
+from sb3_causalgdp.causal.sources import open_source as open_causal_source
 from sb3_causalgdp.offline.sources import Source
 
 KWARGS = {
@@ -439,3 +440,21 @@ def test_without_guidance_the_world_model_does_not_move_the_actor(arrays):
         model.pretrain(3)
         actors.append(list(model.actor.parameters()))
     assert_same(*actors)
+
+
+@pytest.mark.parametrize("has_learned", [False, True])
+def test_a_saved_buffer_brings_its_preloaded_part_wherever_it_is_read(has_learned, arrays, tmp_path):
+    model = make(env=make_vec_env("Pendulum-v1", n_envs=2)).preload(arrays)
+    if has_learned:
+        model.learn(80)
+    n_online = 80 if has_learned else 0
+    model.save_replay_buffer(tmp_path / "buffer")
+    n_preloaded = model.offline_buffer.size() * 2
+    other = make().preload(tmp_path / "buffer.pkl")
+    assert other.offline_buffer.size() == n_preloaded + n_online
+    half = n_preloaded // 2
+    np.testing.assert_array_equal(other.offline_buffer.actions[:half, 0], model.offline_buffer.actions[:half, 0])
+    source = open_causal_source(tmp_path / "buffer.pkl")
+    rows = np.concatenate(list(source.batches(7)))
+    assert source.n_rows == len(rows) == n_preloaded + n_online
+    np.testing.assert_array_equal(np.sort(rows[:, -1]), np.sort(other.offline_buffer.rewards[: len(rows), 0]))

@@ -162,7 +162,8 @@ class MinariSource(Source):
 
 class BufferSource(Source):
     """
-    A replay buffer of SB3: the trajectory of each environment, one after the other.
+    A replay buffer of SB3: the trajectory of each environment, one after the other. The preloaded transitions that were saved
+    with it come first.
 
     :param buffer: The buffer
     :param name: What to call it
@@ -171,33 +172,46 @@ class BufferSource(Source):
     has_scaled_actions = True
 
     def __init__(self, buffer: ReplayBuffer, name: str = "The replay buffer") -> None:
-        if buffer.optimize_memory_usage:
+        self.buffers = [part for part in (preloaded_part_of(buffer), buffer) if part is not None]
+        if any(part.optimize_memory_usage for part in self.buffers):
             raise ValueError(
                 f"{name} was made with optimize_memory_usage=True and does not hold the last observations of its episodes: "
                 "continue it with load_replay_buffer(), or record it without that option"
             )
-        super().__init__(name, buffer.size() * buffer.n_envs, buffer.observation_space, buffer.action_space)
-        self.buffer = buffer
+        n_transitions = sum(part.size() * part.n_envs for part in self.buffers)
+        super().__init__(name, n_transitions, buffer.observation_space, buffer.action_space)
 
     def chunks(self) -> Iterator[Chunk]:
-        buffer = self.buffer
+        for buffer in self.buffers:
+            for column in range(buffer.n_envs):
+                yield from self._trajectory(buffer, column)
+
+    def _trajectory(self, buffer: ReplayBuffer, column: int) -> Iterator[Chunk]:
         positions = np.arange(buffer.pos - buffer.size(), buffer.pos) % buffer.buffer_size
-        for column in range(buffer.n_envs):
-            for first in range(0, len(positions), CHUNK_ROWS):
-                rows = positions[first : first + CHUNK_ROWS]
-                dones = as_flags(buffer.dones[rows, column], f"{self.name}: dones of environment {column}")
-                truncations = as_flags(buffer.timeouts[rows, column], f"{self.name}: timeouts of environment {column}")
-                terminations = dones & ~truncations
-                if rows[-1] == positions[-1] and not dones[-1]:
-                    truncations[-1] = True  # the next one belongs to another environment
-                yield Chunk(
-                    _rows_of(buffer.observations, (rows, column)),
-                    _rows_of(buffer.next_observations, (rows, column)),
-                    buffer.actions[rows, column],
-                    buffer.rewards[rows, column],
-                    terminations,
-                    truncations,
-                )
+        for first in range(0, len(positions), CHUNK_ROWS):
+            rows = positions[first : first + CHUNK_ROWS]
+            dones = as_flags(buffer.dones[rows, column], f"{self.name}: dones of environment {column}")
+            truncations = as_flags(buffer.timeouts[rows, column], f"{self.name}: timeouts of environment {column}")
+            terminations = dones & ~truncations
+            if rows[-1] == positions[-1] and not dones[-1]:
+                truncations[-1] = True  # the next one belongs to another environment
+            yield Chunk(
+                _rows_of(buffer.observations, (rows, column)),
+                _rows_of(buffer.next_observations, (rows, column)),
+                buffer.actions[rows, column],
+                buffer.rewards[rows, column],
+                terminations,
+                truncations,
+            )
+
+
+def preloaded_part_of(buffer: ReplayBuffer) -> ReplayBuffer | None:
+    """
+    :param buffer: A replay buffer that was saved
+    :return: The buffer of preloaded transitions that was saved with it; None if there is none, or it is the same
+    """
+    part, _ = getattr(buffer, "offline_part", (None, []))
+    return None if part is buffer else part
 
 
 class ArraySource(Source):
