@@ -865,9 +865,20 @@ class CausalGDP(OfflineToOnlineAlgorithm):
 
     def load_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
         super().load_replay_buffer(path, truncate_last_traj)
+        assert self.replay_buffer is not None
+        if self.replay_buffer is not self.offline_buffer:
+            # A buffer that was saved later than the model, or by another
+            self._stored_position = max(self._stored_position, self.replay_buffer.size())
         self._fed_offline_position = 0
         if self.offline_buffer is not None and all(mark in self._fed_marks for mark in self._offline_marks):
             self._fed_offline_position = self.offline_buffer.size()
+
+    def _fitting(self, buffer: ReplayBuffer, name: str) -> ReplayBuffer:
+        fitting = super()._fitting(buffer, name)
+        if fitting is not buffer:
+            # The newest rows are no longer at the newest positions: the few that the statistics have not seen are lost to them
+            self._fed_position = self._stored_position
+        return fitting
 
     def _store_transition(self, replay_buffer, buffer_action, new_obs, reward, dones, infos) -> None:
         # Before anything is written: one NaN would spread from the buffer to every network and to the graph

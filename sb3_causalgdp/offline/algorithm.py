@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 import numpy as np
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback, ProgressBarCallback
-from stable_baselines3.common.noise import ActionNoise
+from stable_baselines3.common.noise import ActionNoise, VectorizedActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import MaybeCallback, Schedule
@@ -19,6 +19,7 @@ from stable_baselines3.common.utils import FloatSchedule, configure_logger
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from sb3_causalgdp.files import saved_when_done
+from sb3_causalgdp.offline.loaded_buffers import check_loaded_buffer, in_columns
 from sb3_causalgdp.offline.observations import flat_space
 from sb3_causalgdp.offline.preload import check_buffer, copy_rows, positions_needed, preload_buffer, spaces_of
 from sb3_causalgdp.offline.replay import SpacesEnv, can_sample
@@ -301,6 +302,10 @@ class OfflineToOnlineAlgorithm(OffPolicyAlgorithm):
             self.pretrain(steps, both, progress_bar=progress_bar)
         if self.offline_buffer is not None and self.offline_buffer is self.replay_buffer:
             self.replay_buffer = self._new_buffer(self.buffer_size)
+        noise = self.action_noise
+        if isinstance(noise, VectorizedActionNoise) and noise.n_envs != self.env.num_envs:
+            # Of a model that was saved with another number of environments
+            self.action_noise = VectorizedActionNoise(noise.base_noise, self.env.num_envs)
         return super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
 
     def _sample_action(
@@ -346,20 +351,41 @@ class OfflineToOnlineAlgorithm(OffPolicyAlgorithm):
 
     def load_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
         """
-        Load a replay buffer from a pickle file, and the preloaded transitions that were saved with it.
+        Load a replay buffer from a pickle file, and the preloaded transitions that were saved with it. When it raises, the
+        model has the buffer that it had. Transitions of another number of environments are put into as many columns as the
+        model has environments.
 
         :param path: Path to the pickled replay buffer
         :param truncate_last_traj: See SB3's ``load_replay_buffer``, for ``HerReplayBuffer``
+        :raises ValueError: If the buffer is of another environment, is damaged, holds NaN or infinite values, or is of another
+            number of environments and cannot be brought to the model's
         """
-        super().load_replay_buffer(path, truncate_last_traj)
-        assert self.replay_buffer is not None
-        self.offline_buffer, self._offline_marks = self.replay_buffer.__dict__.pop("offline_part", (None, []))
-        if self.offline_buffer is None:
-            return
-        self.offline_buffer.device = self.device
-        if isinstance(self.offline_buffer, HerReplayBuffer) and self.offline_buffer is not self.replay_buffer:
-            assert self.env is not None
-            self.offline_buffer.set_env(self.env)
+        before = self.replay_buffer
+        try:
+            super().load_replay_buffer(path, truncate_last_traj)
+            self._use_loaded_buffer(str(path) if isinstance(path, str | pathlib.Path) else "The replay buffer")
+        except BaseException:
+            self.replay_buffer = before
+            raise
+
+    def _use_loaded_buffer(self, name: str) -> None:
+        """The model's replay buffer was read from a file: all or nothing."""
+        online = self.replay_buffer
+        assert online is not None
+        offline, marks = online.__dict__.pop("offline_part", (None, []))
+        if offline is not None and offline is not online:
+            offline.device = self.device
+            if isinstance(offline, HerReplayBuffer):
+                assert self.env is not None
+                offline.set_env(self.env)
+            offline = self._fitting(offline, f"{name}, preloaded part")
+        self.replay_buffer = self._fitting(online, name)
+        self.offline_buffer = self.replay_buffer if offline is online else offline
+        self._offline_marks = marks
+
+    def _fitting(self, buffer: ReplayBuffer, name: str) -> ReplayBuffer:
+        check_loaded_buffer(buffer, self.observation_space, self.action_space, name)
+        return buffer if buffer.n_envs == self.n_envs else in_columns(buffer, self.n_envs, self._new_buffer, name)
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "offline_buffer", "_offline_marks"]
