@@ -558,6 +558,8 @@ class CausalGDP(OfflineToOnlineAlgorithm):
         return states_of(self.policy, observation, self._vec_normalize_env)
 
     def train(self, gradient_steps: int, batch_size: int = 256) -> None:
+        if self._waits_for_episode():
+            return
         # Switch to train mode (this affects batch norm / dropout)
         self.policy.set_training_mode(True)
         self._update_learning_rates()

@@ -33,6 +33,10 @@ def make(env="Pendulum-v1", **kwargs):
     return CausalGDP("MlpPolicy", env, **{**KWARGS, **kwargs})
 
 
+def make_hindsight(env, **kwargs):
+    return CausalGDP("MultiInputPolicy", env, replay_buffer_class=HerReplayBuffer, **{**KWARGS, **kwargs})
+
+
 @pytest.fixture(scope="module")
 def arrays():
     env = gym.make("Pendulum-v1")
@@ -369,6 +373,33 @@ def test_hindsight_replay_takes_preloaded_batches_until_an_episode_has_ended(tmp
     loaded.load_replay_buffer(tmp_path / "buffer")
     loaded.learn(30, reset_num_timesteps=False)
     assert loaded.offline_buffer.size() == 60
+
+
+@pytest.mark.parametrize("learns_from_the_start", [False, True])
+def test_hindsight_replay_waits_for_the_end_of_an_episode(learns_from_the_start, tmp_path):
+    model = make_hindsight(GoalEnv(20))
+    if not learns_from_the_start:
+        model.learn(60)
+        model.save(tmp_path / "model")
+        model = CausalGDP.load(tmp_path / "model", env=GoalEnv(20), device="cpu")
+    before = model._n_updates
+    with pytest.warns(UserWarning, match="Updates wait: HerReplayBuffer holds no whole episode yet"):
+        model.learn(30, reset_num_timesteps=False)
+    assert model._n_updates - before == 30 - 20 + 1
+
+
+def test_hindsight_replay_of_another_number_of_environments_is_put_into_as_many_columns(tmp_path):
+    model = make_hindsight(make_vec_env(GoalEnv, 3, env_kwargs={"episode_length": 7}))
+    recorded = make_hindsight(GoalEnv(7), learning_starts=100).learn(49)
+    model.preload(recorded.replay_buffer).learn(60)
+    model.save(tmp_path / "model")
+    model.save_replay_buffer(tmp_path / "buffer")
+    loaded = CausalGDP.load(tmp_path / "model", env=GoalEnv(7), device="cpu")
+    loaded.load_replay_buffer(tmp_path / "buffer")
+    online, offline = loaded.replay_buffer, loaded.offline_buffer
+    assert (online.n_envs, online.size(), offline.n_envs, offline.size()) == (1, 60, 1, 51)
+    assert (online.ep_length[:60] > 0).all() and online.ep_length.max() == 7
+    loaded.learn(20, reset_num_timesteps=False)
 
 
 # From the constructor, as a YAML file says it ----------------------------------------------------------------------

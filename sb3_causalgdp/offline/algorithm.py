@@ -73,6 +73,8 @@ class OfflineToOnlineAlgorithm(OffPolicyAlgorithm):
         self._reward_transform: RewardTransform | None = None
         self._n_pretrain_steps = 0
         self._env_steps_before_pretrain: int | None = None
+        # A buffer of hindsight replay that is known to hold a whole episode: to look for one takes as long as to sample
+        self._buffer_with_episode: ReplayBuffer | None = None
 
     @property
     def n_pretrain_steps(self) -> int:
@@ -314,6 +316,18 @@ class OfflineToOnlineAlgorithm(OffPolicyAlgorithm):
         # A pretrained policy collects the transitions that learning starts with: it knows better than to act at random
         return super()._sample_action(0 if self._n_pretrain_steps > 0 else learning_starts, action_noise, n_envs)
 
+    def _waits_for_episode(self) -> bool:
+        """Whether there is nothing to train on before an episode ends, as where hindsight replay is loaded without a buffer."""
+        buffer = self.replay_buffer
+        known = buffer is self._buffer_with_episode or self.offline_buffer is not None
+        if known or not isinstance(buffer, HerReplayBuffer):
+            return False
+        if can_sample(buffer):
+            self._buffer_with_episode = buffer
+            return False
+        warnings.warn("Updates wait: HerReplayBuffer holds no whole episode yet. They begin when the first one has ended.")
+        return True
+
     def _n_offline(self, batch_size: int) -> int:
         if self.offline_buffer is None:
             return 0
@@ -388,7 +402,7 @@ class OfflineToOnlineAlgorithm(OffPolicyAlgorithm):
         return buffer if buffer.n_envs == self.n_envs else in_columns(buffer, self.n_envs, self._new_buffer, name)
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "offline_buffer", "_offline_marks"]
+        return [*super()._excluded_save_params(), "offline_buffer", "_offline_marks", "_buffer_with_episode"]
 
 
 class _GradientStepsBar(ProgressBarCallback):
