@@ -41,6 +41,7 @@ from sb3_causalgdp.files import saved_when_done
 from sb3_causalgdp.gradients import Gradients, check_compile, compiled, gradients_of, without_checks
 from sb3_causalgdp.losses import critic_loss, denoising_loss, q_loss, quantile, td_target, world_model_loss
 from sb3_causalgdp.offline.algorithm import OfflineToOnlineAlgorithm, callback_list
+from sb3_causalgdp.offline.preload import normalised_parts
 from sb3_causalgdp.offline.replay import concatenate_samples, deal_rows, rows_of
 from sb3_causalgdp.policies import CausalGDPPolicy, CnnPolicy, DiffusionActor, MlpPolicy, MultiInputPolicy, q_values
 from sb3_causalgdp.structural import StatePolicy, actions_of, make_structural_model, states_of
@@ -560,6 +561,7 @@ class CausalGDP(OfflineToOnlineAlgorithm):
     def train(self, gradient_steps: int, batch_size: int = 256) -> None:
         if self._waits_for_episode():
             return
+        self._trained_normalised = normalised_parts(self._vec_normalize_env)
         # Switch to train mode (this affects batch norm / dropout)
         self.policy.set_training_mode(True)
         self._update_learning_rates()

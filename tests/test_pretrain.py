@@ -402,6 +402,77 @@ def test_hindsight_replay_of_another_number_of_environments_is_put_into_as_many_
     loaded.learn(20, reset_num_timesteps=False)
 
 
+# Normalised observations ---------------------------------------------------------------------------------------------------
+
+
+def normalising(**kwargs):
+    return VecNormalize(make_vec_env("Pendulum-v1"), **kwargs)
+
+
+def test_a_resumed_training_counts_the_dataset_once_in_vec_normalize(npz, tmp_path):
+    model = make(env=normalising(), offline_dataset=npz)
+    for _ in range(3):
+        model.learn(20, reset_num_timesteps=False)
+        model.save(tmp_path / "model")
+        model.env.save(tmp_path / "normalize.pkl")
+        env = VecNormalize.load(tmp_path / "normalize.pkl", make_vec_env("Pendulum-v1"))
+        n_counted, returns = env.obs_rms.count, env.ret_rms.count
+        model = CausalGDP.load(tmp_path / "model", env=env, device="cpu")
+    model.preload(npz)
+    assert (env.obs_rms.count, env.ret_rms.count) == (n_counted, returns)
+    assert N_ROWS + 60 <= n_counted <= N_ROWS + 70
+    # A fresh one has not counted it, and other transitions are others
+    fresh = normalising()
+    model = CausalGDP.load(tmp_path / "model", env=fresh, device="cpu").preload(npz)
+    assert round(fresh.obs_rms.count) == N_ROWS
+    model.preload({key: values[:100] for key, values in np.load(npz).items()})
+    assert round(fresh.obs_rms.count) == N_ROWS + 100
+
+
+def test_vec_normalize_that_comes_after_the_dataset_gets_its_statistics(arrays):
+    model = CausalGDP.from_dataset(Described(arrays, gym.make("Pendulum-v1").observation_space), **KWARGS)
+    model.preload(Described(arrays, gym.make("Pendulum-v1").observation_space))
+    before, after = normalising(), normalising()
+    make(env=before).preload(arrays)
+    model.set_env(after)
+    np.testing.assert_array_equal(before.obs_rms.mean, after.obs_rms.mean)
+    np.testing.assert_array_equal(before.ret_rms.var, after.ret_rms.var)
+    model.set_env(after)
+    assert before.obs_rms.count == after.obs_rms.count
+    model = make(reward_transform="antmaze").preload(arrays)
+    with pytest.raises(ValueError, match="VecNormalize scales the rewards already"):
+        model.set_env(normalising())
+    model.set_env(normalising(norm_reward=False))
+
+
+def test_a_policy_that_was_trained_on_raw_observations_is_not_given_normalised_ones(model, tmp_path):
+    model.pretrain(3)
+    model.save(tmp_path / "model")
+    raw = model.env
+    message = r"trained on raw observations, and this VecNormalize would give it .* normalised: pass norm_obs=False to it"
+    with pytest.raises(ValueError, match=message):
+        model.set_env(normalising())
+    assert model.env is raw and model._vec_normalize_env is None
+    with pytest.raises(ValueError, match=message):
+        CausalGDP.load(tmp_path / "model", env=normalising(), device="cpu")
+    model.set_env(normalising(norm_obs=False))
+    model.learn(20)
+
+
+@pytest.mark.filterwarnings("error:The policy was trained on")
+def test_a_policy_that_was_trained_on_normalised_observations_says_so_where_they_are_raw(arrays, tmp_path):
+    model = make(env=normalising()).preload(arrays).pretrain(3)
+    model.save(tmp_path / "model")
+    for env in (normalising(), None):
+        CausalGDP.load(tmp_path / "model", env=env, device="cpu")
+    message = r"trained on observations with \['observation'\] normalised, and this environment gives it raw observations"
+    for env in (make_vec_env("Pendulum-v1"), normalising(norm_obs=False)):
+        with pytest.warns(UserWarning, match=message):
+            model.set_env(env)
+    with pytest.warns(UserWarning, match=message):
+        CausalGDP.load(tmp_path / "model", env=gym.make("Pendulum-v1"), device="cpu")
+
+
 # From the constructor, as a YAML file says it ----------------------------------------------------------------------
 
 

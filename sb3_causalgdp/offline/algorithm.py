@@ -14,14 +14,23 @@ from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback, Pr
 from stable_baselines3.common.noise import ActionNoise, VectorizedActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import MaybeCallback, Schedule
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.utils import FloatSchedule, configure_logger
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_normalize
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from sb3_causalgdp.files import saved_when_done
 from sb3_causalgdp.offline.loaded_buffers import check_loaded_buffer, in_columns
 from sb3_causalgdp.offline.observations import flat_space
-from sb3_causalgdp.offline.preload import check_buffer, copy_rows, positions_needed, preload_buffer, spaces_of
+from sb3_causalgdp.offline.preload import (
+    check_buffer,
+    copy_rows,
+    normalised_parts,
+    positions_needed,
+    preload_buffer,
+    prime_normalizer,
+    spaces_of,
+)
 from sb3_causalgdp.offline.replay import SpacesEnv, can_sample
 from sb3_causalgdp.offline.rewards import RewardTransform, check_reward_transform
 from sb3_causalgdp.offline.sources import Source, open_source
@@ -73,6 +82,8 @@ class OfflineToOnlineAlgorithm(OffPolicyAlgorithm):
         self._reward_transform: RewardTransform | None = None
         self._n_pretrain_steps = 0
         self._env_steps_before_pretrain: int | None = None
+        # Which parts of the observations were normalised when the networks were trained last, None before they were
+        self._trained_normalised: list[str] | None = None
         # A buffer of hindsight replay that is known to hold a whole episode: to look for one takes as long as to sample
         self._buffer_with_episode: ReplayBuffer | None = None
 
@@ -89,6 +100,8 @@ class OfflineToOnlineAlgorithm(OffPolicyAlgorithm):
         if self._env_steps_before_pretrain is not None:
             # Saved by a callback in the middle of pretrain()
             self.num_timesteps, self._env_steps_before_pretrain = self._env_steps_before_pretrain, None
+        if self.env is not None:
+            self._check_normalisation(self._vec_normalize_env)
         super()._setup_model()
         if self.offline_dataset is not None:
             assert self.replay_buffer is not None
@@ -119,6 +132,37 @@ class OfflineToOnlineAlgorithm(OffPolicyAlgorithm):
         model = cls(policy, SpacesEnv(observation_space, action_space, n_envs), **kwargs)
         model.env = None
         return model
+
+    def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
+        """
+        Set the environment, see SB3's ``set_env``. A training ``VecNormalize`` counts the preloaded transitions.
+
+        :param env: The environment
+        :param force_reset: Whether it is reset before training goes on
+        :raises ValueError: If its ``VecNormalize`` would normalise the observations of a policy that was trained on others
+        """
+        normalizer = unwrap_vec_normalize(env) if isinstance(env, VecEnv) else None
+        self._check_normalisation(normalizer)
+        if normalizer is not None and self.offline_buffer is not None and self._reward_transform is not None:
+            check_buffer(self.offline_buffer, self._reward_transform, normalizer)
+        super().set_env(env, force_reset)
+        if normalizer is not None and self.offline_buffer is not None:
+            prime_normalizer(normalizer, self.offline_buffer, (0, self.offline_buffer.size()), self._offline_marks)
+
+    def _check_normalisation(self, normalizer: VecNormalize | None) -> None:
+        before, now = self._trained_normalised, normalised_parts(normalizer)
+        if before is None or before == now:
+            return
+        if not set(now) <= set(before):
+            argument = f"norm_obs_keys={before}" if before else "norm_obs=False"
+            raise ValueError(
+                f"The policy was trained on {_normalised(before)}, and this VecNormalize would give it {_normalised(now)}: "
+                f"pass {argument} to it, or give the model this environment before it is trained or pretrained"
+            )
+        warnings.warn(
+            f"The policy was trained on {_normalised(before)}, and this environment gives it {_normalised(now)}: wrap it with "
+            "VecNormalize.load(path, env) of the training's statistics"
+        )
 
     def preload(
         self: SelfAlgorithm,
@@ -317,7 +361,7 @@ class OfflineToOnlineAlgorithm(OffPolicyAlgorithm):
         return super()._sample_action(0 if self._n_pretrain_steps > 0 else learning_starts, action_noise, n_envs)
 
     def _waits_for_episode(self) -> bool:
-        """Whether there is nothing to train on before an episode ends, as where hindsight replay is loaded without a buffer."""
+        """Whether nothing can be sampled before an episode ends, as in hindsight replay that was loaded without a buffer."""
         buffer = self.replay_buffer
         known = buffer is self._buffer_with_episode or self.offline_buffer is not None
         if known or not isinstance(buffer, HerReplayBuffer):
@@ -403,6 +447,10 @@ class OfflineToOnlineAlgorithm(OffPolicyAlgorithm):
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "offline_buffer", "_offline_marks", "_buffer_with_episode"]
+
+
+def _normalised(parts: list[str]) -> str:
+    return f"observations with {parts} normalised" if parts else "raw observations"
 
 
 class _GradientStepsBar(ProgressBarCallback):
