@@ -83,9 +83,11 @@ class CausalWorldModelCallback(BaseCallback):
         variables, statistics = model.transition_variables, model.causal_statistics
         n_causes = variables.n_states + variables.n_actions
         wanted = max(200, 10 * n_causes) if self.min_transitions is None else self.min_transitions
-        needed = max(wanted, min_rows(model.discovery, variables))
-        if statistics.n_samples < needed:
-            self._say_too_few(statistics.n_samples, needed)
+        needed = min_rows(model.discovery, variables)
+        # Statistics that started anew hold fewer than they have seen; the weights of a half-life do not add up to an integer
+        n_held = min(statistics.n_samples, getattr(statistics, "count", math.inf))
+        if statistics.n_samples < wanted or n_held < needed - 0.5:
+            self._say_too_few(statistics.n_samples if statistics.n_samples < wanted else round(n_held), max(wanted, needed))
             return
         before = model.causal_graph()
         graph = model.discovery(statistics, variables, model._causal_graph)

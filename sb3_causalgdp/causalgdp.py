@@ -53,6 +53,7 @@ from sb3_causalgdp.files import saved_when_done
 from sb3_causalgdp.gradients import Gradients, check_compile, compiled, gradients_of, without_checks
 from sb3_causalgdp.losses import DenoisingTerms, critic_loss, denoising_loss, q_loss, quantile, td_target, world_model_loss
 from sb3_causalgdp.offline.algorithm import OfflineToOnlineAlgorithm, callback_list
+from sb3_causalgdp.offline.preload import normalised_parts
 from sb3_causalgdp.offline.replay import concatenate_samples, deal_rows, rows_of
 from sb3_causalgdp.policies import CausalGDPPolicy, CnnPolicy, DiffusionActor, MlpPolicy, MultiInputPolicy, q_values
 from sb3_causalgdp.structural import StatePolicy, actions_of, make_structural_model, states_of
@@ -595,6 +596,9 @@ class CausalGDP(OfflineToOnlineAlgorithm):
         return states_of(self.policy, observation, self._vec_normalize_env)
 
     def train(self, gradient_steps: int, batch_size: int = 256) -> None:
+        if self._waits_for_episode():
+            return
+        self._trained_normalised = normalised_parts(self._vec_normalize_env)
         # Switch to train mode (this affects batch norm / dropout)
         self.policy.set_training_mode(True)
         self._update_learning_rates()
@@ -943,9 +947,20 @@ class CausalGDP(OfflineToOnlineAlgorithm):
 
     def load_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
         super().load_replay_buffer(path, truncate_last_traj)
+        assert self.replay_buffer is not None
+        if self.replay_buffer is not self.offline_buffer:
+            # A buffer that was saved later than the model, or by another
+            self._stored_position = max(self._stored_position, self.replay_buffer.size())
         self._fed_offline_position = 0
         if self.offline_buffer is not None and all(mark in self._fed_marks for mark in self._offline_marks):
             self._fed_offline_position = self.offline_buffer.size()
+
+    def _fitting(self, buffer: ReplayBuffer, name: str) -> ReplayBuffer:
+        fitting = super()._fitting(buffer, name)
+        if fitting is not buffer:
+            # The newest rows are no longer at the newest positions: the few that the statistics have not seen are lost to them
+            self._fed_position = self._stored_position
+        return fitting
 
     def _sample_action(
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
