@@ -17,10 +17,11 @@ from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy, ContinuousCritic
-from stable_baselines3.common.save_util import load_from_zip_file, recursive_getattr
+from stable_baselines3.common.save_util import load_from_zip_file, open_path, recursive_getattr
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.utils import FloatSchedule, get_parameters_by_name, polyak_update, update_learning_rate
 
+from sb3_causalgdp.archives import errors_of
 from sb3_causalgdp.arguments import (
     CONSTRUCTOR_ARGUMENTS,
     POLICY_ARGUMENTS,
@@ -55,9 +56,12 @@ from sb3_causalgdp.losses import DenoisingTerms, critic_loss, denoising_loss, q_
 from sb3_causalgdp.offline.algorithm import OfflineToOnlineAlgorithm, callback_list
 from sb3_causalgdp.offline.preload import normalised_parts
 from sb3_causalgdp.offline.replay import concatenate_samples, deal_rows, rows_of
+from sb3_causalgdp.plain import Known
 from sb3_causalgdp.policies import CausalGDPPolicy, CnnPolicy, DiffusionActor, MlpPolicy, MultiInputPolicy, q_values
+from sb3_causalgdp.saved import KNOWN, LARGE, append_entries, plain_entries, read_values
 from sb3_causalgdp.structural import StatePolicy, actions_of, make_structural_model, states_of
 
+NETWORKS = ("policy", "actor", "critic", "world_model")
 COMPILED = ("_td_target", "_critic_gradients", "_world_model_gradients", "_actor_gradients")
 
 SelfCausalGDP = TypeVar("SelfCausalGDP", bound="CausalGDP")
@@ -945,8 +949,10 @@ class CausalGDP(OfflineToOnlineAlgorithm):
             self._fed_offline_position = self.offline_buffer.size()
         return self
 
-    def load_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
-        super().load_replay_buffer(path, truncate_last_traj)
+    def load_replay_buffer(
+        self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True, *, trusted: bool = False
+    ) -> None:
+        super().load_replay_buffer(path, truncate_last_traj, trusted=trusted)
         assert self.replay_buffer is not None
         if self.replay_buffer is not self.offline_buffer:
             # A buffer that was saved later than the model, or by another
@@ -1051,7 +1057,7 @@ class CausalGDP(OfflineToOnlineAlgorithm):
     ) -> None:
         """
         Save all the attributes of the object and the model parameters in a zip-file; a file is replaced only once the new one
-        is complete.
+        is complete. What needs no pickle, which is all that is not yours, is read again without one, see :meth:`load`.
 
         :param path: Path to the file where the rl agent should be saved
         :param exclude: Name of parameters that should be excluded in addition to the default ones
@@ -1059,8 +1065,80 @@ class CausalGDP(OfflineToOnlineAlgorithm):
         :raises TrainingDivergedError: If a parameter or an optimizer's state is NaN or infinite; nothing is written then
         """
         self._refuse_to_save_nan()
+        exclude, include = set(exclude or ()), set(include or ())
+        without = exclude.union(self._excluded_save_params()) - include
+        values = {name: value for name, value in vars(self).items() if name not in without and name not in NETWORKS}
+        written, entries = plain_entries(values, self._known_classes())
+        large = written.intersection(LARGE)
+        archive = io.BytesIO()
+        super().save(archive, exclude | large, include - large)
+        append_entries(archive, entries)
         with saved_when_done(path, ".zip") as file:
-            super().save(file, exclude, include)
+            if isinstance(file, pathlib.Path):
+                file.write_bytes(archive.getbuffer())
+            else:
+                open_path(file, "w").write(archive.getbuffer())
+
+    @classmethod
+    def load(  # type: ignore[override]
+        cls: type[SelfCausalGDP],
+        path: str | pathlib.Path | io.BufferedIOBase,
+        env: GymEnv | None = None,
+        device: th.device | str = "auto",
+        custom_objects: dict[str, Any] | None = None,
+        print_system_info: bool = False,
+        force_reset: bool = True,
+        *,
+        trusted: bool = False,
+        **kwargs: Any,
+    ) -> SelfCausalGDP:
+        """
+        Load the model from a zip-file. ``load`` re-creates the model from scratch, it does not update it in-place: for that
+        use ``set_parameters``.
+
+        Nothing that the file brings is run, and what asks for very large networks, buffers or numbers of steps is refused,
+        unless it is trusted. It has to be where it holds what you brought yourself, such as a schedule that is a lambda, or is
+        of a version that pickled all.
+
+        :param path: Path to the file (or a file-like) where to load the agent from
+        :param env: The new environment to run the loaded model on (can be None if you only need prediction from a trained
+            model)
+        :param device: Device on which the code should be run
+        :param custom_objects: What is taken in place of the attributes of these names, which are not read
+        :param print_system_info: Whether to print system info from the saved model and the current system info
+        :param force_reset: Force call to ``reset()`` before training to avoid unexpected behavior
+        :param trusted: Whether the file may bring Python objects that could run code
+        :param kwargs: Extra arguments to change the model when loading
+        :return: The model
+        :raises ValueError: If the file is not whole, or not trusted and needs to be, or does not fit the environment
+        """
+        if custom_objects is not None and not isinstance(custom_objects, dict):
+            raise ValueError(f"custom_objects must be a dict or None, got {type(custom_objects).__name__}")
+        given = {**(custom_objects or {}), **{name: value for name, value in kwargs.items() if name != "policy_kwargs"}}
+        file = open_path(path, "r", suffix="zip")
+        try:
+            with errors_of(path, "cannot be loaded"):
+                saved = read_values(file, cls._known_classes(), given, trusted, cls)
+                values = {**saved.plain, **given}
+                # SB3 replaces only what its own entry names
+                more = {name: value for name, value in values.items() if name in LARGE and name not in saved.named}
+                return super().load(
+                    file,
+                    env,
+                    device,
+                    custom_objects=values,
+                    print_system_info=print_system_info,
+                    force_reset=force_reset,
+                    **{**more, **kwargs},
+                )
+        finally:
+            if file is not path:
+                file.close()
+
+    @classmethod
+    def _known_classes(cls) -> Known:
+        """What a file may name."""
+        return KNOWN + Known([], {*cls.policy_aliases.values(), *CausalGDP.policy_aliases.values()})
 
     def save_checkpoint(self, path: str | pathlib.Path, callback: BaseCallback | None = None) -> pathlib.Path:
         """

@@ -1,7 +1,8 @@
 """Diffusion actor, double critics, their targets and the causal world model, as one SB3 policy."""
 
+import pickle
 from collections.abc import Mapping, Sequence
-from typing import Any, TypeVar
+from typing import Any, BinaryIO, TypeVar
 
 import numpy as np
 import torch as th
@@ -17,10 +18,12 @@ from stable_baselines3.common.torch_layers import (
     get_actor_critic_arch,
 )
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
+from stable_baselines3.common.utils import get_device
 from torch import nn
 
 from sb3_causalgdp.acting import NumpyActing
 from sb3_causalgdp.activations import fast
+from sb3_causalgdp.archives import TRUST, errors_of, opened, size_of
 from sb3_causalgdp.arguments import POLICY_ARGUMENTS, check_arguments, check_keywords
 from sb3_causalgdp.causal import CausalGuidance, LinearisedGuidance, MaskedWorldModel, ReturnTarget, RewardTarget
 from sb3_causalgdp.causal.guidance import OutcomeTarget
@@ -29,7 +32,9 @@ from sb3_causalgdp.diffusion import Guidance, GuidanceRule, MLPDenoiser, NoiseSc
 from sb3_causalgdp.diffusion.samplers import bind, check_sampler
 from sb3_causalgdp.divergence import TrainingDivergedError, first_not_finite
 from sb3_causalgdp.files import saved_when_done
+from sb3_causalgdp.plain import Known, decoded, read_json
 from sb3_causalgdp.products import make_layers_fast
+from sb3_causalgdp.saved import BLOCK, CONTENT, KNOWN, check_limits, check_tensor_file, plain_entries
 
 ACTIVATIONS: dict[str, type[nn.Module]] = {
     "mish": nn.Mish,
@@ -39,6 +44,8 @@ ACTIVATIONS: dict[str, type[nn.Module]] = {
     "elu": nn.ELU,
     "gelu": nn.GELU,
 }
+
+SelfPolicy = TypeVar("SelfPolicy", bound="CausalGDPPolicy")
 
 SelfPolicy = TypeVar("SelfPolicy", bound="CausalGDPPolicy")
 
@@ -420,20 +427,6 @@ class CausalGDPPolicy(BasePolicy):
     def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> Critic:
         return Critic(**self._update_features_extractor(self.critic_kwargs, features_extractor)).to(self.device)
 
-    @classmethod
-    def load(cls: type[SelfPolicy], path: Any, device: th.device | str = "auto") -> SelfPolicy:
-        """
-        :param path: Path of a saved policy
-        :param device: Device on which the policy should be
-        :return: The policy
-        :raises ValueError: If one of its tensors holds NaN or infinity
-        """
-        policy = super().load(path, device)
-        found = policy.first_not_finite()
-        if found is not None:
-            raise ValueError(f"{path} is not a policy that can act: {found[0]} is {found[1]}")
-        return policy
-
     def first_not_finite(self, state_dict: Mapping[str, th.Tensor] | None = None) -> tuple[str, float] | None:
         """
         :param state_dict: Tensors by their names in this policy, None for its own
@@ -469,8 +462,40 @@ class CausalGDPPolicy(BasePolicy):
 
         :param path: File, or file-like object
         """
+        arguments = {**self._get_constructor_parameters(), "lr_schedule": None}
+        written, entries = plain_entries(arguments, known_to_policies())
+        left = {name: value for name, value in arguments.items() if name not in written}
+        saved = {
+            "state_dict": self.state_dict(),
+            "data": left,
+            CONTENT: entries[CONTENT].decode(),
+            BLOCK: th.frombuffer(bytearray(entries[BLOCK] or b"0"), dtype=th.uint8),
+        }
         with saved_when_done(path, "") as file:
-            super().save(file)
+            th.save(saved, file)
+
+    @classmethod
+    def load(  # type: ignore[override]
+        cls: type[SelfPolicy], path: Any, device: th.device | str = "auto", *, trusted: bool = False
+    ) -> SelfPolicy:
+        """
+        Load a policy. Nothing that the file brings is run, unless it is trusted.
+
+        :param path: File, or file-like object
+        :param device: Device on which the policy should be
+        :param trusted: Whether the file may bring Python objects that could run code: it has to, where you gave the policy
+            classes of your own, or it was saved by a version that pickled all
+        :return: The policy
+        :raises ValueError: If the file is not whole, or not trusted and needs to be, or a tensor holds NaN or infinity
+        """
+        with errors_of(path, "cannot be loaded"), opened(path) as file:
+            state, arguments = _read_policy(file, get_device(device), trusted)
+            policy = cls(**arguments)
+            policy.load_state_dict(state)
+            found = policy.first_not_finite()
+            if found is not None:
+                raise ValueError(f"it is not a policy that can act: {found[0]} is {found[1]}")
+            return policy.to(get_device(device))
 
     @property
     def device(self) -> th.device:
@@ -788,3 +813,31 @@ class MultiInputPolicy(CausalGDPPolicy):
 
 
 MlpPolicy = CausalGDPPolicy
+
+
+def known_to_policies() -> Known:
+    """
+    :return: What a saved policy may name
+    """
+    return KNOWN + Known([], [CausalGDPPolicy, CnnPolicy, MultiInputPolicy])
+
+
+def _read_policy(file: BinaryIO, device: th.device, trusted: bool) -> tuple[dict[str, th.Tensor], dict[str, Any]]:
+    """Parameters, and the arguments of the constructor."""
+    if trusted:
+        saved = th.load(file, map_location=device, weights_only=False)
+    else:
+        check_tensor_file(file, "it")
+        try:
+            saved = th.load(file, map_location=device, weights_only=True)
+        except pickle.UnpicklingError as error:
+            raise ValueError(f"it holds pickled objects, which could run code: {TRUST}") from error
+    content = saved.get(CONTENT)
+    arguments = (
+        {} if content is None else decoded(read_json(content), saved[BLOCK].cpu().numpy().tobytes(), known_to_policies())
+    )
+    arguments = {**saved["data"], **arguments}
+    if not trusted:
+        check_limits(arguments, size_of(file))
+    # Schedules are not needed for predictions
+    return saved["state_dict"], {**arguments, "lr_schedule": BasePolicy._dummy_schedule}

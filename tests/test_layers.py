@@ -16,9 +16,9 @@ LAYERS = [
     {"losses", "gradients", "diagnostics", "structural", "device_replay", "cuda_graphs"},
     {"product_pass"},
     {"policies"},
-    {"acting", "arguments"},
+    {"acting", "arguments", "saved"},
     {"causal", "offline", "diffusion"},
-    {"checks", "divergence", "files", "products", "activations"},
+    {"checks", "divergence", "files", "products", "activations", "plain", "archives"},
 ]
 WITHOUT_SB3 = {
     "causal",

@@ -283,7 +283,7 @@ def test_schedules_and_noise_survive():
     model.save(stream)
     with pytest.warns(UserWarning, match="n_steps=3"):
         # SB3's words for a buffer class that it has chosen itself before it was saved
-        loaded = CausalGDP.load(stream, device="cpu")
+        loaded = CausalGDP.load(stream, device="cpu", trusted=True)
     rates = (loaded.lr_schedule(0.5), loaded.critic_lr_schedule(0.5), loaded.world_model_lr_schedule(0.5))
     np.testing.assert_allclose(rates, [5e-4, 1e-3, 1.5e-3])
     assert loaded.action_noise._sigma == pytest.approx(0.3)
@@ -563,7 +563,7 @@ def test_arguments_and_custom_objects_replace_what_was_saved(saved):
 def test_excluded_and_included_attributes(trained):
     stream = io.BytesIO()
     trained.save(stream, exclude=["eta", "_causal_graph"], include=["replay_buffer"])
-    loaded = CausalGDP.load(stream, device="cpu", eta=9.0)
+    loaded = CausalGDP.load(stream, device="cpu", eta=9.0, trusted=True)
     assert loaded.eta == 9.0
     assert loaded.causal_graph().method == "none"
     assert loaded.replay_buffer.pos == trained.replay_buffer.pos
@@ -591,7 +591,7 @@ def test_parameters_of_another_shape_are_refused(saved, tmp_path):
     with pytest.raises(ValueError, match="policy kwargs do not equal"):
         CausalGDP.load(saved / "model.zip", device="cpu", policy_kwargs={"net_arch": [8]})
     (tmp_path / "broken.zip").write_bytes((saved / "model.zip").read_bytes()[:1000])
-    with pytest.raises(ValueError, match="wasn't a zip-file"):
+    with pytest.raises(ValueError, match=r"broken\.zip cannot be loaded: BadZipFile"):
         CausalGDP.load(tmp_path / "broken.zip", device="cpu")
 
 

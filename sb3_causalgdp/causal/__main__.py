@@ -31,14 +31,13 @@ def make_parser() -> argparse.ArgumentParser:
         prog="python -m sb3_causalgdp.causal",
         usage="%(prog)s DATASET_OR_BUFFER [options]",
         description="Find the causal graph of recorded transitions with continuous actions, and print what it says.",
-        epilog="A .pkl file is unpickled, which can execute code: open your own files only.",
     )
     add = parser.add_argument
     add(
         "source",
         metavar="DATASET_OR_BUFFER",
-        help="id of a Minari dataset, a replay buffer from model.save_replay_buffer (.pkl), or an .npz file of the arrays "
-        "observations, actions, next_observations and rewards",
+        help="id of a Minari dataset, a replay buffer from model.save_replay_buffer (.npz, .pkl), or an .npz file of the "
+        "arrays observations, actions, next_observations and rewards",
     )
     add(
         "--method", default="partial_r2", help=f"discovery method, one of {', '.join(sorted(DISCOVERY_METHODS))} (%(default)s)"
@@ -52,6 +51,7 @@ def make_parser() -> argparse.ArgumentParser:
     add("--half-life", type=_positive, metavar="N", help="number of transitions after which an old one weighs half")
     add("--max-rows", type=_positive, metavar="N", help="read at most N transitions, spread evenly over all")
     add("--download", action="store_true", help="download a Minari dataset that is not on this machine")
+    add("--trusted", action="store_true", help="read a pickle that holds more than a buffer of SB3, which could run code")
     add("--quiet", action="store_true", help="no progress bar and no summary")
     return parser
 
@@ -122,7 +122,7 @@ def run(arguments: argparse.Namespace) -> None:
     with _as_value_error("--method-kwargs"):
         method = make_discovery(arguments.method, **kwargs)
     start = time.perf_counter()
-    source = open_source(arguments.source, download=arguments.download, max_rows=arguments.max_rows)
+    source = open_source(arguments.source, download=arguments.download, max_rows=arguments.max_rows, trusted=arguments.trusted)
     with _as_value_error("--method-kwargs"):
         statistics = make_statistics(method, source.variables, arguments.half_life, arguments.window)
     if source.n_rows == 0:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from sb3_causalgdp.archives import errors_of
 from sb3_causalgdp.causal.variables import TransitionVariables
 from sb3_causalgdp.files import replaced_when_done
 
@@ -367,7 +368,8 @@ class CausalGraph:
         :param path: File that ``save`` wrote
         :raises ValueError: when the file does not hold a graph
         """
-        return cls.from_json(Path(path).read_text(encoding="utf-8"))
+        with errors_of(path, "cannot be read as a causal graph"):
+            return cls.from_json(Path(path).read_text(encoding="utf-8"))
 
     def plot(
         self,

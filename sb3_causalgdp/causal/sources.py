@@ -2,18 +2,19 @@
 
 import math
 import os
-import pickle
 import re
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
-from zipfile import BadZipFile
 
 import numpy as np
 from gymnasium import spaces
 
+from sb3_causalgdp.archives import errors_of, existing, is_zip, load_minari, one_line, read_arrays, read_pickle
 from sb3_causalgdp.causal.variables import TransitionVariables
+from sb3_causalgdp.plain import SPACES, Known, decoded, read_json
 
 OFFLINE_HINT = 'pip install "sb3_causalgdp[offline]"'
 MINARI_ID = re.compile(r"[-\w]+(/[-\w]+)*-v\d+")
@@ -22,6 +23,7 @@ BUFFER_ATTRIBUTES = (
     *("observations", "actions", "rewards", "dones", "pos", "full", "buffer_size", "n_envs"),
     *("optimize_memory_usage", "observation_space", "action_space"),
 )
+SUFFIXES = (".npz", ".pkl")
 BATCH_ROWS = 4096
 
 
@@ -254,10 +256,16 @@ class MinariSource(TransitionSource):
         super().__init__(name, variables, int(dataset.total_steps), max_rows)
 
     def _parts(self, n_rows: int) -> Iterator[np.ndarray]:
-        for episode in self.dataset.iterate_episodes():
+        for episode in self._episodes():
             # T steps have T + 1 observations
             states = self._flat(episode.observations)
             yield self.variables.stack(states[:-1], _as_rows(np.asarray(episode.actions)), states[1:], episode.rewards)
+
+    def _episodes(self) -> Iterator[Any]:
+        try:
+            yield from self.dataset.iterate_episodes()
+        except Exception as error:  # h5py raises all kinds on files that are cut off or damaged
+            raise SourceError(f"{self.name} cannot be read, its file is damaged: {one_line(error)}") from error
 
 
 class ArraySource(TransitionSource):
@@ -303,64 +311,87 @@ class ArraySource(TransitionSource):
 
 
 def open_source(
-    path_or_id: str | os.PathLike[str], *, download: bool = False, max_rows: int | None = None
+    path_or_id: str | os.PathLike[str], *, download: bool = False, max_rows: int | None = None, trusted: bool = False
 ) -> TransitionSource:
     """
     Open recorded transitions by name.
 
-    Unpickling a replay buffer can execute code: open your own files only.
-
-    :param path_or_id: A replay buffer that SB3's ``model.save_replay_buffer`` wrote (``.pkl``), arrays that ``numpy.savez``
-        wrote under the names ``observations``, ``actions``, ``next_observations`` and ``rewards`` (``.npz``), or the id of a
-        Minari dataset
+    :param path_or_id: A replay buffer that ``model.save_replay_buffer`` wrote (``.npz``, ``.pkl``), arrays that
+        ``numpy.savez`` wrote under the names ``observations``, ``actions``, ``next_observations`` and ``rewards`` (``.npz``),
+        or the id of a Minari dataset
     :param download: Whether to download a Minari dataset that is not on this machine
     :param max_rows: Read at most this many transitions, spread evenly over all; None reads all
+    :param trusted: Whether a pickled buffer may hold more than what SB3's own are made of, which could run code
     :return: the source
     :raises SourceError: when there is no such source, or discovery cannot use it
     """
-    name, path = os.fspath(path_or_id), Path(path_or_id)
-    readers = {".pkl": _open_replay_buffer, ".npz": _open_arrays}
-    if not path.is_file() and Path(f"{name}.pkl").is_file():
-        path = Path(f"{name}.pkl")  # save_replay_buffer adds the suffix, too
+    name = os.fspath(path_or_id)
+    path = existing(name, SUFFIXES)  # save_replay_buffer adds the suffix, too
     if path.is_file():
-        if path.suffix not in readers:
-            raise SourceError(f"{name} is neither a saved replay buffer (.pkl) nor arrays (.npz)")
-        return readers[path.suffix](path, max_rows)
-    if path.suffix in readers or not MINARI_ID.fullmatch(name):
+        if path.suffix not in SUFFIXES:
+            raise SourceError(f"{name} is neither a saved replay buffer (.npz, .pkl) nor arrays (.npz)")
+        try:
+            return _open_file(path, max_rows, trusted)
+        except SourceError:
+            raise
+        except ValueError as error:
+            raise SourceError(str(error)) from error
+    if path.suffix in SUFFIXES or not MINARI_ID.fullmatch(name):
         raise SourceError(f"no file {name!r}, and the id of a Minari dataset ends in -v and a number")
-    return _open_minari(name, download, max_rows)
+    return _open_minari(name, download, max_rows, trusted)
 
 
-def _open_replay_buffer(path: Path, max_rows: int | None) -> TransitionSource:
-    try:
-        with path.open("rb") as file:
-            buffer = pickle.load(file)
-    except Exception as error:  # a broken pickle can raise anything
-        raise SourceError(f"{path} cannot be read as a replay buffer: {type(error).__name__}: {error}") from error
-    return ReplayBufferSource(buffer, str(path), max_rows)
-
-
-def _open_arrays(path: Path, max_rows: int | None) -> TransitionSource:
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in ARRAYS if name in file}
-    except (BadZipFile, EOFError, OSError, TypeError, ValueError) as error:
-        raise SourceError(f"{path} cannot be read as arrays: {error}") from error
+def _open_file(path: Path, max_rows: int | None, trusted: bool) -> TransitionSource:
+    if path.suffix == ".pkl":
+        with errors_of(path, "cannot be read as a replay buffer"), path.open("rb") as file:
+            buffer = _saved_buffer(read_arrays(path)) if is_zip(file) else read_pickle(file, trusted)
+        return ReplayBufferSource(buffer, str(path), max_rows)
+    with errors_of(path, "cannot be read as arrays"):
+        arrays = read_arrays(path)
+    if "buffer" in arrays:
+        with errors_of(path, "cannot be read as a replay buffer"):
+            buffer = _saved_buffer(arrays)
+        return ReplayBufferSource(buffer, str(path), max_rows)
     missing = [name for name in ARRAYS if name not in arrays]
     if missing:
         raise SourceError(f"{path} lacks the arrays {missing}: it needs {list(ARRAYS)}")
-    return ArraySource(**arrays, name=str(path), max_rows=max_rows)
+    return ArraySource(*(arrays[name] for name in ARRAYS), name=str(path), max_rows=max_rows)
 
 
-def _open_minari(dataset_id: str, download: bool, max_rows: int | None) -> TransitionSource:
+def _saved_buffer(arrays: dict[str, np.ndarray], prefix: str = "") -> Any:
+    """What ``save_replay_buffer`` wrote, with the rows that were stored."""
+    own = {name.removeprefix(prefix): values for name, values in arrays.items() if name.startswith(prefix)}
+    content = read_json(own["buffer"].tobytes())
+    attributes = decoded(content, own["block"].tobytes(), Known(SPACES), only=BUFFER_ATTRIBUTES)
+    missing = [name for name in BUFFER_ATTRIBUTES if name not in (*attributes, *own) and f"{name}/" not in str(list(own))]
+    if missing:
+        raise ValueError(f"it lacks {missing}")
+    for name in ("observations", "next_observations"):
+        keys = [key for key in own if key.startswith(f"{name}/")]
+        if keys:
+            own[name] = {key.removeprefix(f"{name}/"): own[key] for key in keys}  # type: ignore[assignment]
+    buffer = SimpleNamespace(**{**own, **attributes})
+    n_rows = buffer.buffer_size if buffer.full else buffer.pos
+    for name in ("actions", "rewards", "dones"):
+        if own[name].shape[:1] < (n_rows,) or own[name].shape[1:2] != (buffer.n_envs,):
+            raise ValueError(f"{name} has shape {own[name].shape}, of {n_rows} rows and {buffer.n_envs} environments")
+    return buffer
+
+
+def _open_minari(dataset_id: str, download: bool, max_rows: int | None, trusted: bool) -> TransitionSource:
     try:
-        import minari
+        import minari  # noqa: F401
     except ImportError as error:
         raise SourceError(f"no file {dataset_id!r}, and a Minari dataset needs the package minari: {OFFLINE_HINT}") from error
     try:
-        dataset = minari.load_dataset(dataset_id, download=download)
+        dataset = load_minari(dataset_id, download, trusted)
     except FileNotFoundError as error:
         raise SourceError(f"no Minari dataset {dataset_id!r} on this machine: ask for its download (--download)") from error
     except Exception as error:  # of the network, of a server's library, or of a broken file
-        raise SourceError(f"the Minari dataset {dataset_id!r} cannot be loaded: {error}") from error
-    return MinariSource(dataset, dataset_id, max_rows)
+        raise SourceError(f"the Minari dataset {dataset_id!r} cannot be loaded: {one_line(error)}") from error
+    try:
+        return MinariSource(dataset, dataset_id, max_rows)
+    except SourceError:
+        raise
+    except Exception as error:  # of damaged metadata
+        raise SourceError(f"the Minari dataset {dataset_id!r} cannot be read: {one_line(error)}") from error

@@ -1,6 +1,7 @@
 """All that a training is, written in one piece and put back: for any of SB3's off-policy algorithms."""
 
 import copy
+import inspect
 import io
 import random
 import uuid
@@ -21,6 +22,7 @@ from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
+from sb3_causalgdp.archives import errors_of
 from sb3_causalgdp.checkpoints.environments import environment_state, restore_environment
 from sb3_causalgdp.checkpoints.pickles import classes_in, from_bytes, to_bytes
 from sb3_causalgdp.checkpoints.store import Checkpoint, open_checkpoint, run_of, write_checkpoint
@@ -241,8 +243,10 @@ def resume(
     :raises ValueError: If none is whole, or the environment is another one
     """
     with open_checkpoint(Path(path)) as checkpoint:
-        with checkpoint.read(MODEL) as file:
-            model = algorithm.load(io.BytesIO(file.read()), env=env, device=device, force_reset=False)
+        # SB3's own algorithms trust every file
+        trust = {"trusted": trusted} if "trusted" in inspect.signature(algorithm.load).parameters else {}
+        with checkpoint.read(MODEL) as file, errors_of(checkpoint.path, "cannot be resumed"):
+            model = algorithm.load(io.BytesIO(file.read()), env=env, device=device, force_reset=False, **trust)
         _check(model, checkpoint)
         own = bookkeeping_of(model)
         own.run = checkpoint.manifest["run"]

@@ -1,6 +1,7 @@
 """From offline data to online learning, for any off-policy algorithm: preload, pretrain, and batches of both kinds."""
 
 import io
+import os
 import pathlib
 import time
 import warnings
@@ -19,6 +20,7 @@ from stable_baselines3.common.utils import FloatSchedule, configure_logger
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_normalize
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
+from sb3_causalgdp.archives import errors_of, existing
 from sb3_causalgdp.files import saved_when_done
 from sb3_causalgdp.offline.loaded_buffers import check_loaded_buffer, in_columns
 from sb3_causalgdp.offline.observations import flat_space
@@ -33,6 +35,7 @@ from sb3_causalgdp.offline.preload import (
 )
 from sb3_causalgdp.offline.replay import SpacesEnv, can_sample
 from sb3_causalgdp.offline.rewards import RewardTransform, check_reward_transform
+from sb3_causalgdp.offline.saved_buffers import SUFFIXES, can_be_arrays, read_buffer, write_buffer
 from sb3_causalgdp.offline.sources import Source, open_source
 
 SelfAlgorithm = TypeVar("SelfAlgorithm", bound="OfflineToOnlineAlgorithm")
@@ -170,6 +173,7 @@ class OfflineToOnlineAlgorithm(OffPolicyAlgorithm):
         reward_transform: str | None = None,
         progress_bar: bool = False,
         download: bool = True,
+        trusted: bool = False,
     ) -> SelfAlgorithm:
         """
         Load recorded transitions into ``offline_buffer``: all of them, or none when something is wrong with them. Until
@@ -177,7 +181,7 @@ class OfflineToOnlineAlgorithm(OffPolicyAlgorithm):
         buffer of their own, and batches are made from both (``offline_fraction``). A second call adds to the first.
 
         Observations are flattened as the environment's ``FlattenObservation`` does, actions are scaled to [-1, 1], and a
-        training ``VecNormalize`` gets their statistics. Open your own files only: unpickling can execute code.
+        training ``VecNormalize`` gets their statistics.
 
         :param source: The id of a Minari dataset (``"D4RL/pointmaze/umaze-v2"``), a ``minari.MinariDataset``, a replay buffer
             of SB3 or the path of a saved one, or arrays: a mapping (or the path of an ``.npz`` file) of ``observations``,
@@ -185,13 +189,15 @@ class OfflineToOnlineAlgorithm(OffPolicyAlgorithm):
         :param reward_transform: What is done to the rewards, here and in ``learn()``; None takes the constructor's
         :param progress_bar: Whether to show a progress bar (needs tqdm)
         :param download: Whether to download a dataset that is not on this machine
+        :param trusted: Whether a pickled buffer may hold more than what SB3's own are made of, which could run code
         :return: The model
         """
-        data = open_source(source, download)
+        data = open_source(source, download, trusted)
         name = self.reward_transform if reward_transform is None else reward_transform
         if self._reward_transform is not None and name != self.reward_transform:
             raise ValueError(f"The model's rewards are transformed by {self.reward_transform!r} already, got {name!r}")
-        buffer = self._buffer_with_room(data)
+        with errors_of(data.name, "cannot be loaded"):
+            buffer = self._buffer_with_room(data)
         transform = name if self._reward_transform is None else self._reward_transform
         done = preload_buffer(buffer, data, self.env, self._vec_normalize_env, transform, progress_bar)
         if self.replay_buffer is self.offline_buffer or self._replay_buffer_is_empty():
@@ -394,59 +400,71 @@ class OfflineToOnlineAlgorithm(OffPolicyAlgorithm):
 
     def save_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase) -> None:
         """
-        Save the replay buffer as a pickle file, and with it the preloaded transitions. A file is replaced only once the new
-        one is complete.
+        Save the replay buffer, and with it the preloaded transitions: the stored rows as arrays that need no pickle (``.npz``,
+        also where the name has no suffix: such a file can be given away), or with the suffix ``.pkl`` as SB3 does. Buffers of
+        your own classes need a pickle. A file is replaced only once the new one is complete.
 
         :param path: Path to the file where the replay buffer should be saved
+        :raises ValueError: If a buffer of your own class is to be saved as ``.npz``
         """
         assert self.replay_buffer is not None
+        is_path = isinstance(path, str | os.PathLike)
+        suffix = pathlib.Path(path).suffix if is_path else ""  # type: ignore[arg-type]
+        pickled = suffix == ".pkl"
+        if suffix == "" and not can_be_arrays(self.replay_buffer):
+            pickled = True
+            warnings.warn(f"{type(self.replay_buffer).__name__} is pickled: load_replay_buffer needs trusted=True to read it")
         self.replay_buffer.offline_part = (self.offline_buffer, self._offline_marks)  # type: ignore[attr-defined]
         self.replay_buffer.saved_after = self.n_environment_steps  # type: ignore[attr-defined]
         try:
-            with saved_when_done(path, ".pkl") as file:
-                super().save_replay_buffer(file)
+            with saved_when_done(path, ".pkl" if pickled else ".npz") as file:
+                if pickled:
+                    super().save_replay_buffer(file)
+                else:
+                    write_buffer(self.replay_buffer, file)
         finally:
             del self.replay_buffer.offline_part  # type: ignore[attr-defined]
             del self.replay_buffer.saved_after  # type: ignore[attr-defined]
 
-    def load_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
+    def load_replay_buffer(
+        self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True, *, trusted: bool = False
+    ) -> None:
         """
-        Load a replay buffer from a pickle file, and the preloaded transitions that were saved with it. When it raises, the
-        model has the buffer that it had. Transitions of another number of environments are put into as many columns as the
-        model has environments.
+        Load a replay buffer, and the preloaded transitions that were saved with it. When it raises, the model has what it had.
+        Transitions of another number of environments are put into as many columns as the model has environments.
 
-        :param path: Path to the pickled replay buffer
+        :param path: Path to the file, as ``.npz`` or pickled; without its suffix, the first of these that is there
         :param truncate_last_traj: See SB3's ``load_replay_buffer``, for ``HerReplayBuffer``
-        :raises ValueError: If the buffer is of another environment, is damaged, holds NaN or infinite values, or is of another
-            number of environments and cannot be brought to the model's
+        :param trusted: Whether a pickle may hold more than the replay buffers of SB3, which could run code
+        :raises ValueError: If the file is not whole, or not trusted and needs to be; if the buffer is of another environment,
+            is damaged, holds NaN or infinite values, or is of another number of environments and cannot be brought to the model's
         """
-        before = self.replay_buffer
-        try:
-            super().load_replay_buffer(path, truncate_last_traj)
-            self._use_loaded_buffer(str(path) if isinstance(path, str | pathlib.Path) else "The replay buffer")
-        except BaseException:
-            self.replay_buffer = before
-            raise
+        is_path = isinstance(path, str | os.PathLike)
+        buffer = read_buffer(existing(path, SUFFIXES) if is_path else path, trusted)
+        self._use_loaded_buffer(buffer, str(path) if is_path else "The replay buffer", truncate_last_traj)
 
-    def _use_loaded_buffer(self, name: str) -> None:
-        """The model's replay buffer was read from a file: all or nothing."""
-        online = self.replay_buffer
-        assert online is not None
-        offline, marks = online.__dict__.pop("offline_part", (None, []))
-        saved_after = online.__dict__.pop("saved_after", self.num_timesteps)
-        if offline is not None and offline is not online:
-            offline.device = self.device
-            if isinstance(offline, HerReplayBuffer):
-                assert self.env is not None
-                offline.set_env(self.env)
+    def _use_loaded_buffer(self, buffer: ReplayBuffer, name: str, truncate_last_traj: bool) -> None:
+        """All or nothing."""
+        offline, marks = vars(buffer).pop("offline_part", (None, []))
+        saved_after = vars(buffer).pop("saved_after", self.num_timesteps)
+        for one in {id(one): one for one in (buffer, offline) if one is not None}.values():
+            if isinstance(one, HerReplayBuffer):
+                assert self.env is not None, "You must pass an environment at load time when using `HerReplayBuffer`"
+                one.set_env(self.env)
+            # Update saved replay buffer device to match current setting, see GH#1561
+            one.device = self.device
+        online = self._fitting(buffer, name)
+        if offline is buffer:
+            offline = online
+        elif offline is not None:
             offline = self._fitting(offline, f"{name}, preloaded part")
-        self.replay_buffer = self._fitting(online, name)
-        self.offline_buffer = self.replay_buffer if offline is online else offline
-        self._offline_marks = marks
+        if isinstance(online, HerReplayBuffer) and truncate_last_traj:
+            online.truncate_last_trajectory()
+        self.replay_buffer, self.offline_buffer, self._offline_marks = online, offline, marks
         if saved_after != self.num_timesteps:
             warnings.warn(
-                f"{name} was saved after {saved_after} steps, the model after {self.num_timesteps}: they are not of one moment, "
-                "as they are in a checkpoint of save_checkpoint()"
+                f"{name} was saved after {saved_after} steps, the model after {self.num_timesteps}: they are not of one "
+                "moment, as they are in a checkpoint of save_checkpoint()"
             )
 
     def _fitting(self, buffer: ReplayBuffer, name: str) -> ReplayBuffer:

@@ -6,14 +6,14 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
 
 import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
-from stable_baselines3.common.save_util import load_from_pkl
 
+from sb3_causalgdp.archives import errors_of, existing, load_minari, one_line, read_arrays
 from sb3_causalgdp.offline.extras import OFFLINE_HINT
+from sb3_causalgdp.offline.saved_buffers import SUFFIXES, is_buffer, read_buffer
 
 MINARI_ID = re.compile(r"(\w+://[-\w]+/)?[-\w]+(/[-\w]+)*-v\d+")
 ARRAYS = ("observations", "actions", "rewards", "next_observations", "terminations", "truncations")
@@ -153,9 +153,9 @@ class MinariSource(Source):
     def _episodes(self) -> Iterator[Any]:
         try:
             yield from self.dataset.iterate_episodes()
-        except (OSError, KeyError, RuntimeError) as error:  # what h5py raises on files that are cut off or damaged
+        except Exception as error:  # h5py raises all kinds on files that are cut off or damaged
             raise ValueError(
-                f"{self.name} cannot be read, its file is incomplete or damaged: {error}. Delete "
+                f"{self.name} cannot be read, its file is incomplete or damaged: {one_line(error)}. Delete "
                 f"{self.dataset.storage.data_path} and download it again"
             ) from error
 
@@ -264,13 +264,12 @@ def _check_numbers(tree: Any, name: str) -> None:
             raise ValueError(f"{name} must be numbers, got an array of {values.dtype}")
 
 
-def open_source(source: Any, download: bool = True) -> Source:
+def open_source(source: Any, download: bool = True, trusted: bool = False) -> Source:
     """
-    Unpickling a replay buffer can execute code: open your own files only.
-
     :param source: The id of a Minari dataset, a ``minari.MinariDataset``, a replay buffer of SB3 or the path of a saved one
-        (``.pkl``), or arrays: a mapping or the path of what ``numpy.savez`` wrote (``.npz``)
+        (``.npz``, ``.pkl``), or arrays: a mapping or the path of what ``numpy.savez`` wrote (``.npz``)
     :param download: Whether to download a Minari dataset that is not on this machine
+    :param trusted: Whether a pickled buffer may hold more than what SB3's own are made of, which could run code
     :return: The source, of which no row has been read
     :raises FileNotFoundError: If there is no such file or dataset
     :raises ValueError: If it cannot be used
@@ -283,7 +282,7 @@ def open_source(source: Any, download: bool = True) -> Source:
     if isinstance(source, Mapping):
         return ArraySource(source)
     if isinstance(source, str | os.PathLike):
-        return _open_name(os.fspath(source), download)
+        return _open_name(os.fspath(source), download, trusted)
     if hasattr(source, "iterate_episodes"):
         return MinariSource(source)
     raise TypeError(
@@ -292,45 +291,30 @@ def open_source(source: Any, download: bool = True) -> Source:
     )
 
 
-def _open_name(name: str, download: bool) -> Source:
-    path = Path(name)
-    if not path.is_file() and Path(f"{name}.pkl").is_file():
-        path = Path(f"{name}.pkl")  # save_replay_buffer adds the suffix, too
-    if path.suffix == ".npz" and path.is_file():
-        return _open_arrays(path)
+def _open_name(name: str, download: bool, trusted: bool) -> Source:
+    path = existing(name, SUFFIXES)  # save_replay_buffer adds the suffix, too
     if path.is_file():
-        return _open_buffer(path)
-    if path.suffix in (".pkl", ".npz") or not MINARI_ID.fullmatch(name):
+        return _open_file(path, trusted)
+    if path.suffix in SUFFIXES or not MINARI_ID.fullmatch(name):
         raise FileNotFoundError(f"There is no file {name!r}, and the id of a Minari dataset ends in -v and a number")
-    return _open_minari(name, download)
+    return _open_minari(name, download, trusted)
 
 
-def _open_arrays(path: Path) -> Source:
+def _open_file(path: Path, trusted: bool) -> Source:
+    if path.suffix == ".npz" and not is_buffer(path):
+        with errors_of(path, "cannot be read as arrays"):
+            arrays = read_arrays(path, ARRAYS)
+        return ArraySource(arrays, str(path))
+    return BufferSource(read_buffer(path, trusted), str(path))
+
+
+def _open_minari(dataset_id: str, download: bool, trusted: bool) -> Source:
     try:
-        with np.load(path, allow_pickle=False) as file:
-            arrays = {key: file[key] for key in ARRAYS if key in file}
-    except (BadZipFile, EOFError, OSError, TypeError, ValueError) as error:
-        raise ValueError(f"{path} cannot be read as arrays: {error}") from error
-    return ArraySource(arrays, str(path))
-
-
-def _open_buffer(path: Path) -> Source:
-    try:
-        buffer = load_from_pkl(path)
-    except Exception as error:  # a broken pickle can raise anything
-        raise ValueError(f"{path} cannot be read as a replay buffer: {type(error).__name__}: {error}") from error
-    if not isinstance(buffer, ReplayBuffer):
-        raise ValueError(f"{path} holds no replay buffer of SB3 but a {type(buffer).__name__}")
-    return BufferSource(buffer, str(path))
-
-
-def _open_minari(dataset_id: str, download: bool) -> Source:
-    try:
-        import minari
+        import minari  # noqa: F401
     except ImportError as error:
         raise ImportError(f"The Minari dataset {dataset_id!r} needs the package minari: {OFFLINE_HINT}") from error
     try:
-        dataset = minari.load_dataset(dataset_id, download=download)
+        dataset = load_minari(dataset_id, download, trusted)
     except FileNotFoundError as error:
         raise FileNotFoundError(f"The Minari dataset {dataset_id!r} is not on this machine: {error}") from error
     except ImportError as error:
@@ -338,9 +322,10 @@ def _open_minari(dataset_id: str, download: bool) -> Source:
     except Exception as error:  # of the network, of a server's library, or of a broken file
         raise ValueError(
             f"The Minari dataset {dataset_id!r} is not on this machine and cannot be downloaded, or its metadata are "
-            f"damaged: {type(error).__name__}: {error}"
+            f"damaged: {one_line(error)}"
         ) from error
-    return MinariSource(dataset)
+    with errors_of(dataset_id):
+        return MinariSource(dataset)
 
 
 def _as_arrays(values: Any) -> Any:

@@ -4,6 +4,7 @@ import argparse
 import importlib
 import importlib.util
 from collections.abc import Sequence
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from sb3_causalgdp.files import replaced_when_done
 from sb3_causalgdp.zoo.registration import ALGORITHM, SetupError, WithoutReplayBuffer
 from sb3_causalgdp.zoo.report_sections import Played, make_sections
 from sb3_causalgdp.zoo.run_folder import RunFolder, find_runs
+from sb3_causalgdp.zoo.settings import check_modules, safe_files
 
 PROGRAM = "causalgdp-zoo report"
 
@@ -43,10 +45,14 @@ def report(argv: Sequence[str]) -> None:
     parser.add_argument("--episodes", type=int, default=5, help="episodes that the model plays for the page (default: 5)")
     parser.add_argument("--seed", type=int, default=0, help="seed of these episodes (default: 0)")
     parser.add_argument("--device", default="auto", help="device of the model (default: auto)")
+    parser.add_argument("--trusted", action="store_true", help="let the files of the run bring code, as your own may")
     arguments = parser.parse_args(argv)
     if arguments.episodes < 0:
         raise SetupError(f"--episodes must be at least 0, got {arguments.episodes}")
-    runs = find_runs(arguments.logdir)
+    try:
+        runs = find_runs(arguments.logdir, arguments.trusted)
+    except ValueError as error:
+        raise SetupError(str(error)) from error
     if not runs:
         problem = "there is no run in it" if arguments.logdir.is_dir() else "there is no such folder"
         raise SetupError(f"{arguments.logdir}: {problem}. Give the folder of a run, like logs/{ALGORITHM}/Pendulum-v1_1")
@@ -81,7 +87,7 @@ def write_report(
     kind, model_path = _choose_model(run, load_best)
     environment, problem = _make_environment(run, seed)
     try:
-        model = _load_model(model_path, environment, device)
+        model = _load_model(model_path, environment, device, run.trusted)
         played = Played()
         if environment is not None:
             _play(model, environment, episodes, played)
@@ -119,21 +125,30 @@ def _choose_model(run: RunFolder, load_best: bool) -> tuple[str, Path]:
     return kind, models[kind]
 
 
-def _load_model(path: Path, environment: VecEnv | None, device: str) -> CausalGDP:
+def _load_model(path: Path, environment: VecEnv | None, device: str, trusted: bool) -> CausalGDP:
     try:
         # The plain buffer of one transition needs no environment, HER's does
-        return WithoutReplayBuffer.load(path, environment, device, replay_buffer_class=None, replay_buffer_kwargs={})
+        return WithoutReplayBuffer.load(
+            path, environment, device, trusted=trusted, replay_buffer_class=None, replay_buffer_kwargs={}
+        )
     except Exception as error:
         raise SetupError(f"{path} cannot be loaded: {type(error).__name__}: {error}") from error
 
 
 def _make_environment(run: RunFolder, seed: int) -> tuple[VecEnv | None, str | None]:
     """The environment as RL Zoo's enjoy makes it, or what is in the way."""
+    with nullcontext() if run.trusted else safe_files():
+        return _made_environment(run, seed)
+
+
+def _made_environment(run: RunFolder, seed: int) -> tuple[VecEnv | None, str | None]:
     from rl_zoo3.utils import create_test_env, get_saved_hyperparams
 
     if run.environment_id is None or run.settings_path is None:
         return None, "the run has no args.yml, which names the environment"
     try:
+        if not run.trusted:
+            check_modules(run.entry or {}, run.arguments)
         for module in run.arguments.get("gym_packages") or []:
             importlib.import_module(module)
         if run.environment_id not in gym.registry and importlib.util.find_spec("gymnasium_robotics"):

@@ -11,12 +11,13 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
-from stable_baselines3.common.save_util import load_from_pkl
 
 from sb3_causalgdp import CausalGDP
+from sb3_causalgdp.archives import existing
 from sb3_causalgdp.causal import CausalGraph
 from sb3_causalgdp.causal.plots import plot_causal_graph, plot_history
 from sb3_causalgdp.diagnostics import step_divergences
+from sb3_causalgdp.offline.saved_buffers import SUFFIXES, read_buffer
 from sb3_causalgdp.pictures import draw_transitions, plot_guidance_strength, policy_input
 from sb3_causalgdp.zoo.hyperparameters import constructor_arguments
 from sb3_causalgdp.zoo.run_folder import Evaluations, RunFolder, saved_attributes, saved_versions
@@ -129,11 +130,11 @@ def make_sections(
 
 
 def _transitions(run: RunFolder, model: CausalGDP, played: Played) -> Transitions | None:
-    path = run.path / "replay_buffer.pkl"
-    buffer = load_from_pkl(path) if path.is_file() else None
+    path = existing(run.path / "replay_buffer", SUFFIXES)
+    buffer = read_buffer(path, run.trusted) if path.is_file() else None
     if buffer is not None and buffer.size() > 0:
         observations, actions = draw_transitions(buffer, model.policy, OBSERVATIONS)
-        return Transitions(observations, actions, f"{len(actions):,} transitions drawn from replay_buffer.pkl")
+        return Transitions(observations, actions, f"{len(actions):,} transitions drawn from {path.name}")
     if not played.actions:
         return None
     chosen = np.linspace(0, len(played.actions) - 1, min(OBSERVATIONS, len(played.actions))).astype(int)
@@ -344,7 +345,7 @@ def _hyperparameter_section(run: RunFolder, model_path: Path) -> Section:
     else:
         rows = [(str(key), _text(value)) for key, value in sorted(run.entry.items())]
         tables.append(Table(("config.yml", ""), rows, "The entry of the YAML file, with what the command line's -params set:"))
-    saved = saved_attributes(model_path)
+    saved = saved_attributes(model_path, run.trusted)
     rows = []
     for name, parameter in constructor_arguments().items():
         value = getattr(saved.get("policy_class"), "__name__", "") if name == "policy" else _text(saved.get(name))

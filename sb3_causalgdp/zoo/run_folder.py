@@ -1,5 +1,6 @@
 """What RL Zoo left in the folder of a run."""
 
+import json
 import re
 import zipfile
 from collections.abc import Mapping
@@ -8,12 +9,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from stable_baselines3.common.monitor import LoadMonitorResultsError, load_results
 from stable_baselines3.common.results_plotter import X_TIMESTEPS, ts2xy
+
 from stable_baselines3.common.save_util import json_to_data
 
+from sb3_causalgdp import CausalGDP
+from sb3_causalgdp.archives import checked_entries, errors_of, opened, read_arrays, size_of
 from sb3_causalgdp.causal import CausalGraph
+from sb3_causalgdp.plain import read_json
+from sb3_causalgdp.saved import LARGE, is_pickled, read_plain
+from sb3_causalgdp.zoo.settings import read_settings
 
 # RL Zoo's name of a run: the environment, a number, and with --uuid the identifier
 RUN_NAME = re.compile(r"(?P<environment>.+)_(?P<number>\d+)(_[0-9a-f]{8}(-[0-9a-f]{4}){3}-[0-9a-f]{12})?")
@@ -48,21 +54,24 @@ class RunFolder:
     """
     The folder of a run, such as ``logs/causalgdp/Pendulum-v1_1``. Its files are read when they are asked for.
 
-    Saved models and settings are pickles and YAML with Python objects in it, which execute code: open your own only.
+    Nothing that they bring is run, unless they are trusted.
 
     :param path: The folder
+    :param trusted: Whether its files may bring Python objects that could run code
+    :raises ValueError: If its settings cannot be read
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, trusted: bool = False) -> None:
         self.path = path
+        self.trusted = trusted
         found = sorted(path.glob("*/config.yml")) or sorted(path.glob("*/args.yml"))
         self.settings_path = found[0].parent if found else None
         self.arguments: Mapping[str, Any] = self._settings("args.yml") or {}
         self.entry: Mapping[str, Any] | None = self._settings("config.yml")
 
     def _settings(self, name: str) -> Mapping[str, Any] | None:
-        text = self._text(name)
-        settings = None if text is None else yaml.load(text, Loader=yaml.UnsafeLoader)
+        path = None if self.settings_path is None else self.settings_path / name
+        settings = None if path is None or not path.is_file() else read_settings(path, self.trusted)
         return settings if isinstance(settings, Mapping) else None
 
     def _text(self, name: str) -> str | None:
@@ -108,7 +117,7 @@ class RunFolder:
         :return: The causal graphs that the model at the end of the training holds, oldest first; empty without that model
         """
         final = self.models().get("final")
-        return [] if final is None else saved_attributes(final).get("causal_graph_history", [])
+        return [] if final is None else saved_attributes(final, self.trusted).get("causal_graph_history", [])
 
     def checkpoint_graphs(self) -> list[CausalGraph]:
         """
@@ -116,7 +125,7 @@ class RunFolder:
         """
         graphs: dict[int, CausalGraph] = {}
         for _, path in self.checkpoints():
-            graph = saved_attributes(path).get("_causal_graph")
+            graph = saved_attributes(path, self.trusted).get("_causal_graph")
             if graph is not None and graph.num_timesteps is not None:
                 graphs[graph.num_timesteps] = graph
         return [graphs[steps] for steps in sorted(graphs)]
@@ -141,17 +150,26 @@ class RunFolder:
         path = self.path / folder / "evaluations.npz"
         if not path.is_file():
             return None
-        with np.load(path) as arrays:
+        with errors_of(path, "cannot be read as evaluations"):
+            arrays = read_arrays(path, ("timesteps", "results"))
             return Evaluations(arrays["timesteps"], arrays["results"])
 
 
-def saved_attributes(path: Path) -> dict[str, Any]:
+def saved_attributes(path: Path, trusted: bool = False) -> dict[str, Any]:
     """
     :param path: A saved model
-    :return: The attributes of the model, without its networks
+    :param trusted: Whether it may bring Python objects that could run code
+    :return: The attributes of the model, without its networks; of those that need a pickle, their type as text
+    :raises ValueError: If the file cannot be read
     """
-    with zipfile.ZipFile(path) as archive:
-        return json_to_data(archive.read("data").decode())
+    with errors_of(path), opened(path) as file, zipfile.ZipFile(file) as archive:
+        checked_entries(archive, size_of(file))
+        saved = read_json(archive.read("data"))
+        if trusted:
+            return {**json_to_data(json.dumps(saved)), **read_plain(archive, CausalGDP._known_classes())}
+        left_out = {name: value[":type:"] for name, value in saved.items() if is_pickled(value) and name not in LARGE}
+        known = {name: value for name, value in saved.items() if not is_pickled(value)}
+        return {**known, **left_out, **read_plain(archive, CausalGDP._known_classes())}
 
 
 def saved_versions(path: Path) -> dict[str, str]:
@@ -159,26 +177,28 @@ def saved_versions(path: Path) -> dict[str, str]:
     :param path: A saved model
     :return: What SB3 says of the system on which it was saved
     """
-    with zipfile.ZipFile(path) as archive:
+    with errors_of(path), opened(path) as file, zipfile.ZipFile(file) as archive:
+        checked_entries(archive, size_of(file))
         lines = archive.read("system_info.txt").decode().splitlines() if "system_info.txt" in archive.namelist() else []
     pairs = (line.removeprefix("- ").partition(": ") for line in lines)
     return {name: value for name, separator, value in pairs if separator}
 
 
-def find_runs(folder: Path) -> list[RunFolder]:
+def find_runs(folder: Path, trusted: bool = False) -> list[RunFolder]:
     """
     :param folder: The folder of a run, or of an algorithm, which holds those of runs
+    :param trusted: Whether their files may bring Python objects that could run code
     :return: The run; or of each environment the run with the largest number. Empty if there is none
     """
     if _is_run(folder):
-        return [RunFolder(folder)]
+        return [RunFolder(folder, trusted)]
     latest: dict[str, tuple[int, float, Path]] = {}
     for path in folder.iterdir() if folder.is_dir() else ():
         name = RUN_NAME.fullmatch(path.name)
         if name is not None and _is_run(path):
             candidate = (int(name["number"]), path.stat().st_mtime, path)
             latest[name["environment"]] = max(candidate, latest.get(name["environment"], candidate))
-    return [RunFolder(path) for _, (_, _, path) in sorted(latest.items())]
+    return [RunFolder(path, trusted) for _, (_, _, path) in sorted(latest.items())]
 
 
 def _is_run(folder: Path) -> bool:

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from sb3_causalgdp.zoo.registration import ALGORITHM, ZOO_HINT
+from sb3_causalgdp.zoo.settings import safe_files
 
 MODULE = "sb3_causalgdp.zoo"
 
@@ -136,9 +137,10 @@ def optional_hub_files() -> Iterator[None]:
 
 SURROUNDINGS: dict[str, list[Callable[[], Any]]] = {
     "benchmark": [own_commands, optional_hub_files],
-    "enjoy": [optional_hub_files],
+    "enjoy": [optional_hub_files, safe_files],
     "load_from_hub": [optional_hub_files],
-    "push_to_hub": [model_card_metadata, own_model_card, ffmpeg_on_path],
+    "push_to_hub": [safe_files, model_card_metadata, own_model_card, ffmpeg_on_path],
+    "record_video": [safe_files],
     "record_training": [own_commands, ffmpeg_on_path],
 }
 """By script."""

@@ -376,7 +376,7 @@ def test_mistakes_in_the_source(tmp_path, capsys):
         ("missing", "no file"),
         ("broken.pkl", "broken.pkl cannot be read as a replay buffer: UnpicklingError"),
         ("broken.npz", "broken.npz cannot be read as arrays"),
-        ("table.csv", "table.csv is neither a saved replay buffer (.pkl) nor arrays (.npz)"),
+        ("table.csv", "table.csv is neither a saved replay buffer (.npz, .pkl) nor arrays (.npz)"),
         ("list.pkl", "list.pkl holds no replay buffer but a list"),
         ("rollout.pkl", "rollout.pkl holds no replay buffer but a RolloutBuffer"),
         ("empty.pkl", "empty.pkl holds no transitions"),

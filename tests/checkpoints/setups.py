@@ -9,6 +9,7 @@ from small_models import SMALL
 from stable_baselines3 import SAC, HerReplayBuffer
 from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.noise import OrnsteinUhlenbeckActionNoise
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecNormalize
 
@@ -87,7 +88,7 @@ SETUPS = {
         n_envs=2, arguments={"action_noise": OrnsteinUhlenbeckActionNoise(np.zeros(1), 0.3 * np.ones(1))}
     ),
     "whole episodes, schedules": Setup(
-        arguments={"train_freq": (1, "episode"), "gradient_steps": 5, "learning_rate": lambda progress: 1e-3 * progress}
+        arguments={"train_freq": (1, "episode"), "gradient_steps": 5, "learning_rate": LinearSchedule(1e-3, 0.0, 1.0)}
     ),
     "SAC": Setup(arguments={"learning_starts": 50}, algorithm=SAC),
 }

@@ -137,11 +137,13 @@ def sources(dataset, episodes, tmp_path):
     arrays = arrays_of(episodes)
     np.savez(tmp_path / "arrays.npz", **arrays)
     first = make().preload(dataset)
-    first.save_replay_buffer(tmp_path / "buffer")
-    return [minari.load_dataset(dataset), arrays, tmp_path / "arrays.npz", first.replay_buffer, str(tmp_path / "buffer.pkl")]
+    for name in ("buffer", "buffer.pkl"):
+        first.save_replay_buffer(tmp_path / name)
+    saved = [str(tmp_path / name) for name in ("buffer", "buffer.npz", "buffer.pkl")]
+    return [minari.load_dataset(dataset), arrays, tmp_path / "arrays.npz", first.replay_buffer, *saved]
 
 
-@pytest.mark.parametrize("kind", range(5), ids=["MinariDataset", "dict", "npz", "ReplayBuffer", "pkl"])
+@pytest.mark.parametrize("kind", range(7), ids=["MinariDataset", "dict", "npz", "ReplayBuffer", "plain", "suffix", "pkl"])
 def test_all_sources_give_the_same(kind, dataset, episodes, tmp_path):
     buffer = make().preload(sources(dataset, episodes, tmp_path)[kind]).replay_buffer
     assert_holds(buffer, arrays_of(episodes))

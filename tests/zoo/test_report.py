@@ -253,7 +253,7 @@ def test_an_environment_that_is_not_here_is_no_reason_to_stop(zoo, run):
 
 
 def test_graphs_are_read_from_checkpoints_each_once(run):
-    run_folder = RunFolder(run)
+    run_folder = RunFolder(run, trusted=True)
     (graph,) = run_folder.checkpoint_graphs()
     assert graph.num_timesteps == 240
     # An older one, found at 120 steps

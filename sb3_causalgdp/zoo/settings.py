@@ -1,0 +1,140 @@
+"""Files of RL Zoo's runs, read without running what they bring: YAML with Python's tags, and saved normalizations."""
+
+import ast
+from collections import OrderedDict
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any
+
+import yaml
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
+
+from sb3_causalgdp.archives import errors_of, read_pickle
+
+TAG = "tag:yaml.org,2002:python/"
+# Modules that a run's settings may name: importing another may run code that came with the run
+HARMLESS = ("gymnasium", "gymnasium_robotics", "minari", "rl_zoo3", "sb3_causalgdp", "sb3_contrib", "stable_baselines3")
+
+
+class PlainLoader(yaml.SafeLoader):
+    """YAML, and those of Python's tags that are data: what RL Zoo writes."""
+
+
+def _tuple(loader: PlainLoader, node: Any) -> tuple:
+    return tuple(loader.construct_sequence(node, deep=True))
+
+
+def _ordered(loader: PlainLoader, node: Any) -> OrderedDict:
+    arguments = loader.construct_sequence(node, deep=True)
+    return OrderedDict(*arguments[:1])
+
+
+def _refused(loader: PlainLoader, suffix: str, node: Any) -> Any:
+    raise ValueError(f"it holds !!python/{suffix}, which could run code: if you trust where the file is from, use --trusted")
+
+
+for _name, _construct in {
+    "str": PlainLoader.construct_yaml_str,
+    "unicode": PlainLoader.construct_yaml_str,
+    "int": PlainLoader.construct_yaml_int,
+    "long": PlainLoader.construct_yaml_int,
+    "float": PlainLoader.construct_yaml_float,
+    "bool": PlainLoader.construct_yaml_bool,
+    "none": PlainLoader.construct_yaml_null,
+    "list": PlainLoader.construct_yaml_seq,
+    "dict": PlainLoader.construct_yaml_map,
+    "tuple": _tuple,
+    "object/apply:collections.OrderedDict": _ordered,
+}.items():
+    PlainLoader.add_constructor(f"{TAG}{_name}", _construct)
+PlainLoader.add_multi_constructor(TAG, _refused)
+
+
+def read_settings(path: Path, trusted: bool = False) -> Any:
+    """
+    :param path: A YAML file of a run
+    :param trusted: Whether it may name Python objects that could run code
+    :return: What it says
+    :raises ValueError: If it cannot be read, or not trusted and needs to be; in one line
+    """
+    with errors_of(path, "cannot be read as YAML"):
+        text = path.read_text(encoding="utf-8")
+        return yaml.load(text, Loader=yaml.UnsafeLoader if trusted else PlainLoader)
+
+
+def load_normalizer(load_path: str, venv: VecEnv) -> VecNormalize:
+    """
+    As ``VecNormalize.load``, for files of strangers.
+
+    :param load_path: What ``VecNormalize.save`` wrote
+    :param venv: The environment that is normalised
+    :return: The normalised environment
+    :raises ValueError: If the file holds anything else
+    """
+    with errors_of(load_path, "cannot be read as VecNormalize"), open(load_path, "rb") as file:
+        normalizer = read_pickle(file)
+        if not isinstance(normalizer, VecNormalize):
+            raise ValueError(f"it holds a {type(normalizer).__name__}")
+        normalizer.set_venv(venv)
+        return normalizer
+
+
+def check_normalize(settings: Any) -> None:
+    """
+    :param settings: Of a run; RL Zoo evaluates ``normalize`` as Python
+    :raises ValueError: If that is more than a dictionary of numbers and names
+    """
+    value = settings.get("normalize") if isinstance(settings, Mapping) else None
+    if not isinstance(value, str):
+        return
+    try:
+        call = ast.parse(value.strip(), mode="eval").body
+        if isinstance(call, ast.Call) and isinstance(call.func, ast.Name) and call.func.id == "dict" and not call.args:
+            for keyword in call.keywords:
+                ast.literal_eval(keyword.value)
+        else:
+            ast.literal_eval(call)
+    except (ValueError, SyntaxError, TypeError, RecursionError, MemoryError) as error:
+        raise ValueError(f"normalize must be a dictionary of numbers, got {value[:80]!r}") from error
+
+
+def check_modules(settings: Mapping[str, Any], arguments: Mapping[str, Any]) -> None:
+    """
+    :param settings: Hyperparameters of a run
+    :param arguments: Of its command line
+    :raises ValueError: If they name modules that may have come with the run
+    """
+    names = [str(name) for name in arguments.get("gym_packages") or []]
+    environment = str(arguments.get("env", ""))
+    names += [environment.partition(":")[0]] if ":" in environment else []
+    for key in ("env_wrapper", "vec_env_wrapper"):
+        wrappers = settings.get(key) or []
+        for wrapper in wrappers if isinstance(wrappers, list) else [wrappers]:
+            names.append(str(next(iter(wrapper), "") if isinstance(wrapper, Mapping) else wrapper))
+    for name in names:
+        if name.partition(".")[0] not in HARMLESS:
+            raise ValueError(f"the run names the module of {name!r}, which could run code: if you trust it, use --trusted")
+
+
+@contextmanager
+def safe_files() -> Iterator[None]:
+    """RL Zoo reads YAML and normalizations of runs as its own files, which run what they hold."""
+    import rl_zoo3.utils as zoo
+
+    from sb3_causalgdp.zoo.scripts import replaced
+
+    read = zoo.get_saved_hyperparams
+
+    def read_checked(stats_path: str, *args: Any, **kwargs: Any) -> Any:
+        path = Path(stats_path, "config.yml")
+        if path.is_file():
+            with errors_of(path):
+                check_normalize(read_settings(path))
+        return read(stats_path, *args, **kwargs)
+
+    with ExitStack() as stack:
+        stack.enter_context(replaced(yaml, "UnsafeLoader", PlainLoader))
+        stack.enter_context(replaced(VecNormalize, "load", staticmethod(load_normalizer)))
+        stack.enter_context(replaced(zoo, "get_saved_hyperparams", read_checked))
+        yield
