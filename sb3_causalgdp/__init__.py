@@ -5,6 +5,7 @@ from pathlib import Path
 from sb3_causalgdp.callbacks import CausalWorldModelCallback
 from sb3_causalgdp.causalgdp import CausalGDP
 from sb3_causalgdp.checkpoints import TrainingCheckpointCallback
+from sb3_causalgdp.divergence import TrainingDivergedError
 from sb3_causalgdp.policies import CnnPolicy, MlpPolicy, MultiInputPolicy
 
 __version__ = Path(__file__).with_name("version.txt").read_text(encoding="utf-8").strip()
@@ -16,5 +17,6 @@ __all__ = [
     "MlpPolicy",
     "MultiInputPolicy",
     "TrainingCheckpointCallback",
+    "TrainingDivergedError",
     "__version__",
 ]

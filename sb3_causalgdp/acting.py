@@ -36,7 +36,7 @@ def _constant(value: float) -> np.ndarray:
 _ZERO, _ONE, _MINUS_ONE, _TWO = _constant(0.0), _constant(1.0), _constant(-1.0), _constant(2.0)
 _LARGEST_EXPONENT = _constant(20.0)
 _ROUNDING = _constant(8.0 * float(np.finfo(np.float32).eps))
-_SMALLEST_STD, _MOST_CHANGE = _constant(1e-4), _constant(4.0)  # those of MaskedWorldModel
+_SMALLEST_RESIDUAL_STD, _MOST_CHANGE = _constant(1e-4), _constant(4.0)  # those of MaskedWorldModel
 
 
 class Activation(NamedTuple):
@@ -376,12 +376,11 @@ class _WorldModel:
     def response(self, state: np.ndarray, action: np.ndarray) -> dict[str, np.ndarray]:
         arrays = self.arrays
         n_states = state.shape[1]
-        state_std = np.maximum(np.sqrt(arrays["state_variance"]), _SMALLEST_STD)
-        reward_scale = np.maximum(np.sqrt(arrays["reward_variance"]), _SMALLEST_STD)
+        state_std, reward_scale = np.sqrt(arrays["state_unit_square"]), np.sqrt(arrays["reward_unit_square"])
         gate = arrays["state_to_state"].diagonal()
         closed = _ONE - gate
         change = np.minimum(arrays["change_variance"] / (state_std * state_std), _MOST_CHANGE)
-        residual_std = np.maximum(np.sqrt(closed * closed + gate * change), _SMALLEST_STD)
+        residual_std = np.maximum(np.sqrt(closed * closed + gate * change), _SMALLEST_RESIDUAL_STD)
         standardised = (state - arrays["state_mean"]) / state_std
         inputs = np.concatenate([_clip(standardised, *self.input_bounds), action], axis=1)
         mask = np.concatenate([arrays["state_to_state"], arrays["action_to_state"]], axis=1)
@@ -405,7 +404,7 @@ class _WorldModel:
     def reward_distribution(self, standardised: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Means and standard deviation in the environment's units, from the standardised means."""
         arrays = self.arrays
-        scale = np.maximum(np.sqrt(arrays["reward_variance"]), _SMALLEST_STD)
+        scale = np.sqrt(arrays["reward_unit_square"])
         std = np.exp(arrays["reward_log_std"].clip(*self.log_std_bounds)) * scale
         return arrays["reward_mean"] + scale * standardised, std
 

@@ -83,9 +83,11 @@ class CausalWorldModelCallback(BaseCallback):
         variables, statistics = model.transition_variables, model.causal_statistics
         n_causes = variables.n_states + variables.n_actions
         wanted = max(200, 10 * n_causes) if self.min_transitions is None else self.min_transitions
-        needed = max(wanted, min_rows(model.discovery, variables))
-        if statistics.n_samples < needed:
-            self._say_too_few(statistics.n_samples, needed)
+        needed = min_rows(model.discovery, variables)
+        # Statistics that started anew hold fewer than they have seen; the weights of a half-life do not add up to an integer
+        n_held = min(statistics.n_samples, getattr(statistics, "count", math.inf))
+        if statistics.n_samples < wanted or n_held < needed - 0.5:
+            self._say_too_few(statistics.n_samples if statistics.n_samples < wanted else round(n_held), max(wanted, needed))
             return
         before = model.causal_graph()
         graph = model.discovery(statistics, variables, model._causal_graph)
@@ -167,12 +169,16 @@ class CausalWorldModelCallback(BaseCallback):
         return rows
 
     def _states(self, observations: np.ndarray | dict[str, np.ndarray], positions: np.ndarray) -> np.ndarray:
+        policy = self.model.policy
+        # Only networks have to be asked on their device; not all devices know double precision
+        device = self.model.device if policy.has_image_state else "cpu"
+
         def rows(values: np.ndarray) -> th.Tensor:
-            return th.as_tensor(values[positions].reshape(-1, *values.shape[2:]), device=self.model.device)
+            return th.as_tensor(values[positions].reshape(-1, *values.shape[2:]), device=device)
 
         if isinstance(observations, dict):
-            return self.model.policy.causal_state({key: rows(values) for key, values in observations.items()}).cpu().numpy()
-        return self.model.policy.causal_state(rows(observations)).cpu().numpy()
+            return policy.exact_causal_state({key: rows(values) for key, values in observations.items()}).cpu().numpy()
+        return policy.exact_causal_state(rows(observations)).cpu().numpy()
 
     def _draw_observations(self, buffer: ReplayBuffer) -> PyTorchObs:
         """A batch as the policy sees it, straight from the arrays: a HER buffer cannot sample before an episode has ended."""

@@ -1,9 +1,11 @@
 """CausalGDP: what happens when."""
 
 import io
+import math
 import pathlib
 from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
+from copy import deepcopy
 from functools import partial
 from typing import Any, ClassVar, NamedTuple, TypeVar
 
@@ -15,11 +17,19 @@ from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy, ContinuousCritic
-from stable_baselines3.common.save_util import open_path
+from stable_baselines3.common.save_util import load_from_zip_file, open_path, recursive_getattr
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.utils import FloatSchedule, get_parameters_by_name, polyak_update, update_learning_rate
 
 from sb3_causalgdp.archives import errors_of
+from sb3_causalgdp.arguments import (
+    CONSTRUCTOR_ARGUMENTS,
+    POLICY_ARGUMENTS,
+    check_action_space,
+    check_arguments,
+    check_keywords,
+    counts_episodes,
+)
 from sb3_causalgdp.callbacks import CausalWorldModelCallback
 from sb3_causalgdp.causal import (
     ActionEffects,
@@ -33,23 +43,24 @@ from sb3_causalgdp.causal import (
     make_statistics,
 )
 from sb3_causalgdp.causal.interventions import ActionRule
-from sb3_causalgdp.causal.world_model import MaskedWorldModel
+from sb3_causalgdp.causal.world_model import MaskedWorldModel, moves
 from sb3_causalgdp.checkpoints import TrainingCheckpointCallback, begin_training, resume, save_checkpoint
-from sb3_causalgdp.checkpoints.checkpoint import all_callbacks, bookkeeping_of, fresh_seed
-from sb3_causalgdp.checks import check_at_least_zero, is_count
+from sb3_causalgdp.checkpoints.checkpoint import all_callbacks, bookkeeping_of, end_last_episodes, fresh_seed
+from sb3_causalgdp.checks import first_not_finite_index, fits_float32, is_finite
 from sb3_causalgdp.cuda_graphs import UpdateGraphs, why_not_recorded
 from sb3_causalgdp.device_replay import DeviceReplay
+from sb3_causalgdp.divergence import ParametersError, TrainingDivergedError, check_optimizer_state, first_not_finite
 from sb3_causalgdp.files import saved_when_done
 from sb3_causalgdp.gradients import Gradients, check_compile, compiled, gradients_of, without_checks
-from sb3_causalgdp.losses import critic_loss, denoising_loss, q_loss, quantile, td_target, world_model_loss
+from sb3_causalgdp.losses import DenoisingTerms, critic_loss, denoising_loss, q_loss, quantile, td_target, world_model_loss
 from sb3_causalgdp.offline.algorithm import OfflineToOnlineAlgorithm, callback_list
+from sb3_causalgdp.offline.preload import normalised_parts
 from sb3_causalgdp.offline.replay import concatenate_samples, deal_rows, rows_of
 from sb3_causalgdp.plain import Known
 from sb3_causalgdp.policies import CausalGDPPolicy, CnnPolicy, DiffusionActor, MlpPolicy, MultiInputPolicy, q_values
 from sb3_causalgdp.saved import KNOWN, LARGE, append_entries, plain_entries, read_values
 from sb3_causalgdp.structural import StatePolicy, actions_of, make_structural_model, states_of
 
-ACTOR_UPDATES = ("one_step", "chain")
 NETWORKS = ("policy", "actor", "critic", "world_model")
 COMPILED = ("_td_target", "_critic_gradients", "_world_model_gradients", "_actor_gradients")
 
@@ -112,6 +123,10 @@ class CausalGDP(OfflineToOnlineAlgorithm):
     :param actor_update: Which action the Q term of the policy loss judges. ``one_step``: the clean action that the noise
         prediction of the denoising term gives already (EDP, https://arxiv.org/abs/2305.20081), half the cost of an update;
         ``chain``: the end of the whole chain, through which the gradient then flows (Diffusion-QL)
+    :param q_scale: What the Q term is divided by. ``advantage``: by how much the Q of the policy's actions differs from that
+        of the replayed ones, in the mean; ``value``: by the mean absolute Q (Diffusion-QL), which grows with the returns
+    :param bound_penalty: Weight, in the policy loss, of the mean squared distance of clean actions from [-1, 1] before they
+        are clipped, so that none goes so far that it finds no way back
     :param policy_delay: The actor is updated once every so many gradient steps, as in TD3. Where a call of :meth:`train` makes
         many steps, the TD targets of those from one update of the actor to the next are computed at once
     :param world_model_delay: The world model is updated once every so many gradient steps
@@ -214,6 +229,8 @@ class CausalGDP(OfflineToOnlineAlgorithm):
         eta: float = 1.0,
         denoising_weight: float = 0.05,
         actor_update: str = "one_step",
+        q_scale: str = "advantage",
+        bound_penalty: float = 0.1,
         policy_delay: int = 2,
         world_model_delay: int = 2,
         max_q_backup: bool = False,
@@ -251,6 +268,12 @@ class CausalGDP(OfflineToOnlineAlgorithm):
         device: th.device | str = "auto",
         _init_setup_model: bool = True,
     ) -> None:
+        # SB3 keeps them, and looks at them late or not at all
+        check_arguments(CONSTRUCTOR_ARGUMENTS, locals())
+        if isinstance(policy, str) and policy not in self.policy_aliases:
+            raise ValueError(f"policy must be one of {list(self.policy_aliases)} or a class, got {policy!r}, which is unknown")
+        if env is None and _init_setup_model:
+            raise ValueError("env must be an id or an environment, got None: from_dataset() needs none")
         super().__init__(
             policy,
             env,
@@ -286,6 +309,8 @@ class CausalGDP(OfflineToOnlineAlgorithm):
         self.eta = eta
         self.denoising_weight = denoising_weight
         self.actor_update = actor_update
+        self.q_scale = q_scale
+        self.bound_penalty = bound_penalty
         self.policy_delay = policy_delay
         self.world_model_delay = world_model_delay
         self.max_q_backup = max_q_backup
@@ -335,9 +360,11 @@ class CausalGDP(OfflineToOnlineAlgorithm):
         self._check_arguments()
         policy_kwargs = self.policy_kwargs
         # The policy gets our arguments too, but they must not enter the user's own dictionary
-        self.policy_kwargs = {**self._own_policy_kwargs(), **policy_kwargs}
+        self.policy_kwargs = {**self._own_policy_kwargs(), **policy_kwargs, **check_arguments(POLICY_ARGUMENTS, policy_kwargs)}
         try:
             super()._setup_model()
+        except MemoryError as error:
+            raise ValueError(f"buffer_size={self.buffer_size} does not fit into memory: {error}") from error
         finally:
             self.policy_kwargs = policy_kwargs
         if self.num_timesteps > 0 and self.seed is not None:
@@ -374,7 +401,10 @@ class CausalGDP(OfflineToOnlineAlgorithm):
             raise ValueError(reason)
 
     def _setup_discovery(self) -> None:
-        self.discovery = make_discovery(self.causal_discovery, **self.causal_discovery_kwargs)
+        try:
+            self.discovery = make_discovery(self.causal_discovery, **self.causal_discovery_kwargs)
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"causal_discovery_kwargs: {error}") from error
         action_names = tuple(f"action[{index}]" for index in range(self.actor.action_dim))
         self.transition_variables = TransitionVariables(self.policy.state_names(), action_names)
         method = self.causal_discovery
@@ -390,22 +420,34 @@ class CausalGDP(OfflineToOnlineAlgorithm):
             self._fed_marks = []
 
     def _check_arguments(self) -> None:
-        check_at_least_zero(eta=self.eta, denoising_weight=self.denoising_weight)
-        if self.causal_refresh_freq < 1:
-            raise ValueError(f"causal_refresh_freq must be at least 1 environment step, got {self.causal_refresh_freq!r}")
-        for name in ("policy_delay", "world_model_delay"):
-            delay = getattr(self, name)
-            if not is_count(delay):
-                raise ValueError(f"{name} must be an integer of at least 1 gradient step, got {delay!r}")
-        if self.actor_update not in ACTOR_UPDATES:
-            raise ValueError(f"Unknown actor_update {self.actor_update!r}: it must be one of {list(ACTOR_UPDATES)}")
-        threads = self.torch_threads
-        if not (threads in (None, "auto") or is_count(threads)):
-            raise ValueError(f"torch_threads must be 'auto', None or an integer of at least 1, got {threads!r}")
-        if self.max_grad_norm is not None and self.max_grad_norm <= 0.0:
-            raise ValueError(f"max_grad_norm must be positive or None, got {self.max_grad_norm!r}")
-        if not (isinstance(self.cuda_graph, bool) or self.cuda_graph == "auto"):
-            raise ValueError(f"cuda_graph must be True, False or 'auto', got {self.cuda_graph!r}")
+        """Those that are attributes by now, perhaps brought by ``load()``, which become what is to be stored."""
+        attributes = {"stats_window_size": "_stats_window_size"}
+        names = {name: attributes.get(name, name) for name in CONSTRUCTOR_ARGUMENTS if name not in ("policy", "env", "device")}
+        given = {name: getattr(self, attribute) for name, attribute in names.items() if hasattr(self, attribute)}
+        for name, value in check_arguments(CONSTRUCTOR_ARGUMENTS, given).items():
+            if value is not given[name]:
+                setattr(self, names[name], value)
+        if not issubclass(self.policy_class, CausalGDPPolicy):
+            raise ValueError(f"policy must be a subclass of CausalGDPPolicy, got {self.policy_class.__name__}")
+        check_keywords("policy_kwargs", self.policy_kwargs, self.policy_class)
+        check_action_space(self.action_space)
+        self._check_together()
+
+    def _check_together(self) -> None:
+        """Arguments that are right alone, and not with the others."""
+        n_positions = self.buffer_size // self.n_envs
+        if counts_episodes(self.train_freq) and self.n_envs > 1:
+            raise ValueError(f"train_freq must be in steps with {self.n_envs} environments, got {self.train_freq!r}")
+        if self.replay_buffer_class is None and self.n_steps > 1:
+            if isinstance(self.observation_space, spaces.Dict) or self.optimize_memory_usage:
+                what = "optimize_memory_usage" if self.optimize_memory_usage else "a Dict of observations"
+                raise ValueError(f"n_steps must be 1 with {what}, got {self.n_steps}")
+            if self.n_steps > n_positions:
+                raise ValueError(f"n_steps must be at most {n_positions}, buffer_size / n_envs, got {self.n_steps}")
+        if self.optimize_memory_usage and n_positions < 2:
+            raise ValueError(f"buffer_size must be at least 2 n_envs with optimize_memory_usage, got {self.buffer_size}")
+        if self.replay_buffer_class is not None or self.n_steps == 1:
+            check_keywords("replay_buffer_kwargs", self.replay_buffer_kwargs, self.replay_buffer_class or ReplayBuffer)
 
     def _own_policy_kwargs(self) -> dict[str, Any]:
         names = (
@@ -429,11 +471,6 @@ class CausalGDP(OfflineToOnlineAlgorithm):
         rate = self.critic_learning_rate
         self.critic_lr_schedule = None if rate is None else FloatSchedule(rate)
         self.world_model_lr_schedule = FloatSchedule(self.world_model_learning_rate)
-        check_at_least_zero(
-            learning_rate=self.lr_schedule(1.0),
-            critic_learning_rate=(self.critic_lr_schedule or self.lr_schedule)(1.0),
-            world_model_learning_rate=self.world_model_lr_schedule(1.0),
-        )
 
     def _update_learning_rates(self) -> None:
         self._update_learning_rate(self.actor.optimizer)
@@ -563,6 +600,9 @@ class CausalGDP(OfflineToOnlineAlgorithm):
         return states_of(self.policy, observation, self._vec_normalize_env)
 
     def train(self, gradient_steps: int, batch_size: int = 256) -> None:
+        if self._waits_for_episode():
+            return
+        self._trained_normalised = normalised_parts(self._vec_normalize_env)
         # Switch to train mode (this affects batch norm / dropout)
         self.policy.set_training_mode(True)
         self._update_learning_rates()
@@ -576,11 +616,33 @@ class CausalGDP(OfflineToOnlineAlgorithm):
         names = [name for step_names, _ in losses for name in step_names]
         # One transfer from the device for all of them
         values = th.cat([step_values for _, step_values in losses]).tolist()
+        if not math.isfinite(sum(values)):
+            self._check_losses(list(zip(names, values, strict=True)))
         by_name: dict[str, list[float]] = {name: [] for name in names}
         for name, value in zip(names, values, strict=True):
             by_name[name].append(value)
         for name, of_steps in by_name.items():
             self.logger.record(f"train/{name}", sum(of_steps) / len(of_steps))
+
+    def _check_losses(self, losses: list[tuple[str, float]]) -> None:
+        """
+        :param losses: Of each step, with their names; each step has one of the critics
+        :raises TrainingDivergedError: With the first that is NaN or infinite
+        """
+        last = self._n_updates
+        first = last - sum(name == "critic_loss" for name, _ in losses) + 1
+        delays = {"critic_loss": 1, "world_model_transition_loss": self.world_model_delay}
+        delays["world_model_reward_loss"] = self.world_model_delay
+        steps: dict[str, Iterator[int]] = {}
+        found = []
+        for place, (name, value) in enumerate(losses):
+            delay = delays.get(name, self.policy_delay)
+            step = next(steps.setdefault(name, (step for step in range(first, last + 1) if step % delay == 0)))
+            if not math.isfinite(value):
+                found.append((step, place, name, value))
+        if found:
+            step, _, name, value = min(found)
+            raise TrainingDivergedError(name, value, step)
 
     def _gradient_steps(self, gradient_steps: int, batch_size: int) -> list[tuple[list[str], th.Tensor]]:
         """The losses of each step, their names and their values."""
@@ -622,7 +684,7 @@ class CausalGDP(OfflineToOnlineAlgorithm):
         if self._update_graphs is None:
             return self._steps_up_to_actor_update(plans, *batches)
         # All that the steps depend on and that may change while it trains
-        weights = (self.eta, self.denoising_weight, self.tau, self.gamma, self.max_grad_norm)
+        weights = (self.eta, self.denoising_weight, self.bound_penalty, self.q_scale, self.tau, self.gamma, self.max_grad_norm)
         scales = (self.policy.state_guidance_scale, self.policy.outcome_guidance_scale)
         kind = (plans, weights, scales, len(batches[0].rewards))
         return self._update_graphs.run(kind, partial(self._steps_up_to_actor_update, plans), batches)
@@ -741,7 +803,8 @@ class CausalGDP(OfflineToOnlineAlgorithm):
         return {"critic_loss": loss}
 
     def _critic_gradients(self, replay_data, target: th.Tensor) -> tuple[th.Tensor, th.Tensor, Gradients]:
-        target_std = target.std(correction=0).clamp(min=1e-3)
+        target_std, target_mean = th.std_mean(target, correction=0)
+        target_std = th.where(moves(target_std, target_mean), target_std, 1.0)
         loss = critic_loss(self.critic(replay_data.observations, replay_data.actions), target)
         return target_std, loss.detach(), gradients_of(self.critic, loss)
 
@@ -778,18 +841,21 @@ class CausalGDP(OfflineToOnlineAlgorithm):
         return transition.detach(), reward.detach(), gradients_of(self.world_model, transition + reward)
 
     def _update_actor(self, transitions, next_actions: th.Tensor, plan: StepPlan) -> dict[str, th.Tensor]:
-        denoising, q_term, loss, gradients = self._actor_gradients(transitions, next_actions, plan.climbed, plan.guided)
+        losses, gradients = self._actor_gradients(transitions, next_actions, plan.climbed, plan.guided)
         self._step(self.actor, gradients)
-        return {"actor_loss": loss, "denoising_loss": denoising, "q_loss": q_term}
+        return losses
 
     def _actor_gradients(
         self, transitions, next_actions: th.Tensor, climbed: int, guided: bool
-    ) -> tuple[th.Tensor, th.Tensor, th.Tensor, Gradients]:
+    ) -> tuple[dict[str, th.Tensor], Gradients]:
         denoising, q_term = self._actor_losses(transitions, next_actions, climbed, guided)
-        loss = self.denoising_weight * denoising + self.eta * q_term
-        return denoising.detach(), q_term.detach(), loss.detach(), gradients_of(self.actor, loss)
+        loss = self.denoising_weight * denoising.loss + self.eta * q_term + self.bound_penalty * denoising.outside
+        losses = {"actor_loss": loss, "denoising_loss": denoising.loss, "q_loss": q_term, "bound_loss": denoising.outside}
+        return {name: value.detach() for name, value in losses.items()}, gradients_of(self.actor, loss)
 
-    def _actor_losses(self, transitions, next_actions: th.Tensor, climbed: int, guided: bool) -> tuple[th.Tensor, th.Tensor]:
+    def _actor_losses(
+        self, transitions, next_actions: th.Tensor, climbed: int, guided: bool
+    ) -> tuple[DenoisingTerms, th.Tensor]:
         observations = transitions.observations
         features = self.actor.features(observations)
         guidance = rule = None
@@ -802,16 +868,21 @@ class CausalGDP(OfflineToOnlineAlgorithm):
                     predicted, _ = self.world_model.predict_next_state(state, transitions.actions)
                 next_state = th.where(transitions.dones > 0.0, predicted, next_state)
             guidance = self.policy.make_guidance(state, next_state, next_actions, climbed)
-        denoising, clean_actions = denoising_loss(
-            self.actor.denoiser, self.actor.schedule, features, transitions.actions, guidance, rule
-        )
-        actions = clean_actions if self.actor_update == "one_step" else self.actor.sample(features)
+        denoising = denoising_loss(self.actor.denoiser, self.actor.schedule, features, transitions.actions, guidance, rule)
+        actions = denoising.clean_actions if self.actor_update == "one_step" else self.actor.sample(features)
+        return denoising, self._q_term(observations, actions, transitions.actions, climbed)
+
+    def _q_term(self, observations, actions: th.Tensor, of_data: th.Tensor, climbed: int) -> th.Tensor:
         other = (climbed + 1) % len(self.critic.q_networks)
+        climbed_network, other_network = slice(climbed, climbed + 1), slice(other, other + 1)
+        replayed = None
         with th.no_grad():
-            critic_features = self.critic.extract_features(observations, self.critic.features_extractor)
-            (scale,) = q_values(self.critic, critic_features, actions, slice(other, other + 1))
-        (values,) = q_values(self.critic, critic_features, actions, slice(climbed, climbed + 1))
-        return denoising, q_loss(values, scale)
+            features = self.critic.extract_features(observations, self.critic.features_extractor)
+            (others,) = q_values(self.critic, features, actions, other_network)
+            if self.q_scale == "advantage":
+                (replayed,) = q_values(self.critic, features, of_data, other_network)
+        (values,) = q_values(self.critic, features, actions, climbed_network)
+        return q_loss(values, others, replayed)
 
     def _step(self, module: th.nn.Module, gradients: Gradients) -> None:
         parameters = self._parameters[module]
@@ -852,9 +923,19 @@ class CausalGDP(OfflineToOnlineAlgorithm):
             progress_bar=progress_bar,
         )
 
-    def _setup_learn(self, *args, **kwargs) -> tuple[int, BaseCallback]:
-        result = super()._setup_learn(*args, **kwargs)
-        self._check_finite(self._last_obs, "observation")
+    def _setup_learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        reset_num_timesteps: bool = True,
+        *args,
+        **kwargs,
+    ) -> tuple[int, BaseCallback]:
+        if self.replay_buffer is not None and (reset_num_timesteps or self._last_obs is None):
+            # SB3 resets the environments
+            end_last_episodes(self.replay_buffer)
+        result = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, *args, **kwargs)
+        self._check_finite(self._last_obs if self._vec_normalize_env is None else self._last_original_obs, "observation")
         return result
 
     def preload(self: SelfCausalGDP, source: Any, *args, **kwargs) -> SelfCausalGDP:
@@ -872,14 +953,39 @@ class CausalGDP(OfflineToOnlineAlgorithm):
         self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True, *, trusted: bool = False
     ) -> None:
         super().load_replay_buffer(path, truncate_last_traj, trusted=trusted)
+        assert self.replay_buffer is not None
+        if self.replay_buffer is not self.offline_buffer:
+            # A buffer that was saved later than the model, or by another
+            self._stored_position = max(self._stored_position, self.replay_buffer.size())
         self._fed_offline_position = 0
         if self.offline_buffer is not None and all(mark in self._fed_marks for mark in self._offline_marks):
             self._fed_offline_position = self.offline_buffer.size()
 
+    def _fitting(self, buffer: ReplayBuffer, name: str) -> ReplayBuffer:
+        fitting = super()._fitting(buffer, name)
+        if fitting is not buffer:
+            # The newest rows are no longer at the newest positions: the few that the statistics have not seen are lost to them
+            self._fed_position = self._stored_position
+        return fitting
+
+    def _sample_action(
+        self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
+    ) -> tuple[np.ndarray, np.ndarray]:
+        try:
+            action, buffer_action = super()._sample_action(learning_starts, action_noise, n_envs)
+        except TrainingDivergedError as error:
+            raise TrainingDivergedError(error.quantity, error.value, self._n_updates) from None
+        if not is_finite(buffer_action):
+            # The policy's own actions are looked at in predict()
+            raise ValueError(f"action_noise gave an action of NaN at step {self.num_timesteps}: {action_noise}")
+        return action, buffer_action
+
     def _store_transition(self, replay_buffer, buffer_action, new_obs, reward, dones, infos) -> None:
         # Before anything is written: one NaN would spread from the buffer to every network and to the graph
-        self._check_finite(new_obs, "observation")
-        self._check_finite(reward, "reward")
+        normalizer = self._vec_normalize_env
+        # What is stored: infinity was clipped in what was normalised
+        self._check_finite(new_obs if normalizer is None else normalizer.old_obs, "observation")
+        self._check_finite(reward if normalizer is None else normalizer.old_reward, "reward")
         for info, done in zip(infos, dones, strict=True):
             if done and info.get("terminal_observation") is not None:
                 self._check_finite(info["terminal_observation"], "terminal observation")
@@ -890,17 +996,58 @@ class CausalGDP(OfflineToOnlineAlgorithm):
         if isinstance(values, dict):
             for key, part in values.items():
                 self._check_finite(part, f"{name}[{key!r}]")
-        elif not np.isfinite(values).all():
-            where = np.argwhere(~np.isfinite(np.atleast_1d(values)))[0].tolist()
+        elif not fits_float32(np.asarray(values)):
+            values = np.atleast_1d(values)
+            where = first_not_finite_index(values)
+            what = f"{name} that is infinite in float32" if np.isfinite(values[where]) else f"NaN or infinite {name}"
             raise ValueError(
-                f"The environment returned a NaN or infinite {name} at step {self.num_timesteps}, index {where}: "
-                f"{np.atleast_1d(values)[tuple(where)]}. Nothing of this step was stored; see VecCheckNan to find its origin."
+                f"The environment returned a {what} at step {self.num_timesteps}, index {list(where)}: "
+                f"{values[where]}. Nothing of this step was stored; see VecCheckNan to find its origin."
             )
 
     def set_parameters(self, load_path_or_dict, exact_match: bool = True, device: th.device | str = "auto") -> None:
-        super().set_parameters(load_path_or_dict, exact_match, device)
-        # Optimizers have other tensors now
-        self._setup_cuda_graphs()
+        """
+        Load parameters from a zip-file or a nested dictionary, all or nothing.
+
+        :param load_path_or_dict: Path of a saved model, or what ``get_parameters`` gave
+        :param exact_match: Whether the parameters of each module, and each of their parameters, have to be there
+        :param device: Device on which the code should run
+        :raises ValueError: If one is NaN or infinite, unknown or missing, or an optimizer's state does not fit its parameters
+        :raises RuntimeError: If a network is another one
+        """
+        params = load_path_or_dict
+        if not isinstance(params, dict):
+            _, params, _ = load_from_zip_file(params, device=device, load_data=False)
+        before = deepcopy(self.get_parameters())
+        self._check_parameters(params)
+        try:
+            super().set_parameters(params, exact_match, device)
+        except Exception as error:
+            super().set_parameters(before)  # type: ignore[arg-type]
+            if isinstance(error, ValueError):
+                raise ParametersError(f"Nothing was loaded: {error}") from error
+            raise
+        finally:
+            # Optimizers have other tensors now
+            self._setup_cuda_graphs()
+
+    def _check_parameters(self, params: Mapping[str, Any]) -> None:
+        for name, state in params.items():
+            owner = recursive_getattr(self, name, None)
+            if isinstance(owner, th.optim.Optimizer):
+                check_optimizer_state(owner, state, name)
+            found = self.policy.first_not_finite(state) if owner is self.policy else first_not_finite(state, name)
+            if found is not None:
+                raise ParametersError(f"Nothing was loaded: {found[0]} holds {found[1]}, and all parameters have to be finite")
+
+    def _refuse_to_save_nan(self) -> None:
+        """
+        :raises TrainingDivergedError: If a parameter or an optimizer's state is NaN or infinite
+        """
+        for name, state in self.get_parameters().items():
+            found = self.policy.first_not_finite(state) if name == "policy" else first_not_finite(state, name)
+            if found is not None:
+                raise TrainingDivergedError(*found, self._n_updates)
 
     def save(
         self,
@@ -915,7 +1062,9 @@ class CausalGDP(OfflineToOnlineAlgorithm):
         :param path: Path to the file where the rl agent should be saved
         :param exclude: Name of parameters that should be excluded in addition to the default ones
         :param include: Name of parameters that might be excluded but should be included anyway
+        :raises TrainingDivergedError: If a parameter or an optimizer's state is NaN or infinite; nothing is written then
         """
+        self._refuse_to_save_nan()
         exclude, include = set(exclude or ()), set(include or ())
         without = exclude.union(self._excluded_save_params()) - include
         values = {name: value for name, value in vars(self).items() if name not in without and name not in NETWORKS}

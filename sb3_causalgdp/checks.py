@@ -1,7 +1,11 @@
-"""Checks of arguments that several classes take."""
+"""Checks of arguments and arrays that several classes make."""
 
 import math
 from typing import Any
+
+import numpy as np
+
+LARGEST_FLOAT32 = float(np.finfo(np.float32).max)
 
 
 def check_at_least_zero(**values: Any) -> None:
@@ -14,9 +18,27 @@ def check_at_least_zero(**values: Any) -> None:
             raise ValueError(f"{name} must be a finite number of at least 0, got {value!r}")
 
 
-def is_count(value: Any) -> bool:
+def is_finite(values: np.ndarray) -> bool:
     """
-    :param value: What was given for an argument
-    :return: Whether it is an integer of at least 1
+    :param values: Of any type and shape
+    :return: Whether all are finite
     """
-    return isinstance(value, int) and not isinstance(value, bool) and value >= 1
+    return values.dtype.kind != "f" or bool(np.isfinite(values).all())
+
+
+def fits_float32(values: np.ndarray) -> bool:
+    """
+    :param values: Of any type and shape
+    :return: Whether all are finite, and stay so in float32
+    """
+    if values.dtype.itemsize <= 4 or values.dtype.kind != "f":
+        return is_finite(values)
+    return bool((np.abs(values) <= LARGEST_FLOAT32).all())
+
+
+def first_not_finite_index(values: np.ndarray) -> tuple[int, ...]:
+    """
+    :param values: Numbers that are not all finite in float32
+    :return: Index of the first that is not, one number for each axis, at least one
+    """
+    return tuple(np.argwhere(~(np.abs(np.atleast_1d(values)) <= LARGEST_FLOAT32))[0].tolist())

@@ -1,14 +1,37 @@
 """What each update minimises: one small function a loss, on tensors alone."""
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import torch as th
 import torch.nn.functional as F
 
 from sb3_causalgdp.causal.world_model import MaskedWorldModel
+from sb3_causalgdp.diffusion.bounds import bounded, outside
 from sb3_causalgdp.diffusion.guidance import Guidance, GuidanceRule, guidance_shift
 from sb3_causalgdp.diffusion.samplers import Denoiser, bind
 from sb3_causalgdp.diffusion.schedules import NoiseSchedule
+
+
+# So small that only zeros are smaller
+SMALLEST_SCALE = 1e-20
+# Of the level of Q: differences below are rounding
+SMALLEST_DIFFERENCE = 1e-5
+
+
+class DenoisingTerms(NamedTuple):
+    """
+    What one noise prediction is judged by.
+
+    :param loss: Mean over the batch and the action's components
+    :param clean_actions: Clipped to [-1, 1] with a gradient that leads back inside, shape ``(batch, d)``: one step stands for
+        the whole chain in the policy improvement of EDP (Kang et al., 2023, equation 9)
+    :param outside: Mean squared distance of the clean actions from their bounds before they are clipped
+    """
+
+    loss: th.Tensor
+    clean_actions: th.Tensor
+    outside: th.Tensor
 
 
 def td_target(
@@ -50,7 +73,7 @@ def denoising_loss(
     actions: th.Tensor,
     guidance: Guidance | None = None,
     rule: GuidanceRule | None = None,
-) -> tuple[th.Tensor, th.Tensor]:
+) -> DenoisingTerms:
     """
     ``E || eps_theta(a^k, k, s) - eps_cg ||^2``: the noise really injected, shifted by the guidance (stop-gradient).
 
@@ -60,30 +83,37 @@ def denoising_loss(
     :param actions: Clean actions, shape ``(batch, d)``
     :param guidance: What shifts the target, None for the plain denoising loss
     :param rule: How the guidance enters, needed with a guidance
-    :return: Mean over the batch and the action's components; and the clean actions that the same noise prediction gives,
-        clipped to [-1, 1], shape ``(batch, d)``: one step stands for the whole chain in the policy improvement of EDP (Kang
-        et al., 2023, equation 9)
+    :return: The loss, and what the same noise prediction says of the clean actions
     """
     step = th.randint(schedule.n_steps, (len(actions),), device=actions.device)
     noise = th.randn_like(actions)
     noisy = schedule.add_noise(actions, noise, step)
     predict_noise = bind(denoiser, features)
     predicted = predict_noise(noisy, step)
-    clean_action = schedule.clean_estimate(noisy, predicted, step).clamp(-1.0, 1.0)
+    clean_action = schedule.clean_estimate(noisy, predicted, step)
     if guidance is not None and rule is not None:
         noise = noise - guidance_shift(guidance, rule, predict_noise, schedule, noisy, predicted.detach(), step)
-    return F.mse_loss(predicted, noise), clean_action
+    return DenoisingTerms(F.mse_loss(predicted, noise), bounded(clean_action), outside(clean_action))
 
 
-def q_loss(values: th.Tensor, scale: th.Tensor) -> th.Tensor:
+def q_loss(values: th.Tensor, others: th.Tensor, of_data: th.Tensor | None = None) -> th.Tensor:
     """
-    ``-E[Q_i(s, G_theta(s; z))] / E|Q_j|``: one critic is climbed, another one sets the scale (Diffusion-QL).
+    ``-E[Q_i(s, G_theta(s; z))]`` over a scale: one critic is climbed, another one sets the scale.
+
+    Without ``of_data`` the scale is ``E|Q_j|`` (Diffusion-QL). It grows with the returns and with every reward that does not
+    depend on the action, and the Q term loses its weight. With ``of_data`` the scale is the mean of
+    ``|Q_j(s, G_theta(s; z)) - Q_j(s, a)|``: what the choice of the action makes a difference of.
 
     :param values: Q_i at the actor's actions, shape ``(batch, 1)``
-    :param scale: Q_j at the same actions, shape ``(batch, 1)``; no gradient flows through it
+    :param others: Q_j at the same actions, shape ``(batch, 1)``; no gradient flows through it
+    :param of_data: Q_j at the actions of the batch, shape ``(batch, 1)``; no gradient flows through it
     :return: Scalar
     """
-    return -values.mean() / scale.detach().abs().mean().clamp(min=1e-6)
+    level = others.detach().abs().mean()
+    if of_data is None:
+        return -values.mean() / level.clamp(min=SMALLEST_SCALE)
+    difference = (others - of_data).detach().abs().mean()
+    return -values.mean() / th.maximum(difference, SMALLEST_DIFFERENCE * level).clamp(min=SMALLEST_SCALE)
 
 
 def world_model_loss(

@@ -1,9 +1,10 @@
 """Diffusion actor, double critics, their targets and the causal world model, as one SB3 policy."""
 
 import pickle
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, BinaryIO, TypeVar
 
+import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy, ContinuousCritic
@@ -23,11 +24,13 @@ from torch import nn
 from sb3_causalgdp.acting import NumpyActing
 from sb3_causalgdp.activations import fast
 from sb3_causalgdp.archives import TRUST, errors_of, opened, size_of
+from sb3_causalgdp.arguments import POLICY_ARGUMENTS, check_arguments, check_keywords
 from sb3_causalgdp.causal import CausalGuidance, LinearisedGuidance, MaskedWorldModel, ReturnTarget, RewardTarget
 from sb3_causalgdp.causal.guidance import OutcomeTarget
-from sb3_causalgdp.checks import check_at_least_zero
+from sb3_causalgdp.checks import first_not_finite_index, fits_float32, is_finite
 from sb3_causalgdp.diffusion import Guidance, GuidanceRule, MLPDenoiser, NoiseSchedule, sample
 from sb3_causalgdp.diffusion.samplers import bind, check_sampler
+from sb3_causalgdp.divergence import TrainingDivergedError, first_not_finite
 from sb3_causalgdp.files import saved_when_done
 from sb3_causalgdp.plain import Known, decoded, read_json
 from sb3_causalgdp.products import make_layers_fast
@@ -41,7 +44,8 @@ ACTIVATIONS: dict[str, type[nn.Module]] = {
     "elu": nn.ELU,
     "gelu": nn.GELU,
 }
-GUIDANCE_TARGETS = ("return", "reward")
+
+SelfPolicy = TypeVar("SelfPolicy", bound="CausalGDPPolicy")
 
 SelfPolicy = TypeVar("SelfPolicy", bound="CausalGDPPolicy")
 
@@ -300,6 +304,9 @@ class CausalGDPPolicy(BasePolicy):
         exploration_noise: float = 0.2,
         discount: float = 0.99,
     ) -> None:
+        check_arguments(POLICY_ARGUMENTS, locals())
+        check_keywords("features_extractor_kwargs", features_extractor_kwargs or {}, features_extractor_class)
+        check_keywords("optimizer_kwargs", optimizer_kwargs or {}, optimizer_class)
         super().__init__(
             observation_space,
             action_space,
@@ -309,15 +316,6 @@ class CausalGDPPolicy(BasePolicy):
             optimizer_kwargs=optimizer_kwargs,
             squash_output=True,
             normalize_images=normalize_images,
-        )
-        if guidance_target not in GUIDANCE_TARGETS:
-            raise ValueError(f"Unknown guidance_target {guidance_target!r}: it must be one of {list(GUIDANCE_TARGETS)}")
-        if n_action_candidates < 1:
-            raise ValueError(f"n_action_candidates must be at least 1, got {n_action_candidates!r}")
-        check_at_least_zero(
-            exploration_noise=exploration_noise,
-            state_guidance_scale=state_guidance_scale,
-            outcome_guidance_scale=outcome_guidance_scale,
         )
         self.guidance_rule = None if guidance is None else GuidanceRule(guidance, guidance_covariance, guidance_scale)
         self.guidance_kwargs: dict[str, Any] = {
@@ -396,11 +394,14 @@ class CausalGDPPolicy(BasePolicy):
             # One kernel for all parameters: the update takes half the time
             optimizer_kwargs = {"fused": True, **optimizer_kwargs}
         for module in (self.actor, self.critic, self.world_model):
-            module.optimizer = self.optimizer_class(  # type: ignore[assignment]
-                module.parameters(),
-                lr=lr_schedule(1),  # type: ignore[call-arg]
-                **optimizer_kwargs,
-            )
+            try:
+                module.optimizer = self.optimizer_class(  # type: ignore[assignment]
+                    module.parameters(),
+                    lr=lr_schedule(1),  # type: ignore[call-arg]
+                    **optimizer_kwargs,
+                )
+            except (TypeError, ValueError) as error:
+                raise ValueError(f"optimizer_kwargs={self.optimizer_kwargs!r} do not fit: {error}") from error
         self.actor_target.set_training_mode(False)
         self.critic_target.set_training_mode(False)
 
@@ -425,6 +426,16 @@ class CausalGDPPolicy(BasePolicy):
 
     def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> Critic:
         return Critic(**self._update_features_extractor(self.critic_kwargs, features_extractor)).to(self.device)
+
+    def first_not_finite(self, state_dict: Mapping[str, th.Tensor] | None = None) -> tuple[str, float] | None:
+        """
+        :param state_dict: Tensors by their names in this policy, None for its own
+        :return: Name and value of the first number that is NaN or infinite, None if there is none. Buffers of features
+            extractors may hold infinity, as masks of attention do
+        """
+        state_dict = self.state_dict() if state_dict is None else state_dict
+        buffers = [f"policy.{name}" for name, _ in self.named_buffers() if "features_extractor" in name]
+        return first_not_finite(state_dict, "policy", buffers)
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         data = super()._get_constructor_parameters()
@@ -475,12 +486,15 @@ class CausalGDPPolicy(BasePolicy):
         :param trusted: Whether the file may bring Python objects that could run code: it has to, where you gave the policy
             classes of your own, or it was saved by a version that pickled all
         :return: The policy
-        :raises ValueError: If the file is not whole, or not trusted and needs to be
+        :raises ValueError: If the file is not whole, or not trusted and needs to be, or a tensor holds NaN or infinity
         """
         with errors_of(path, "cannot be loaded"), opened(path) as file:
             state, arguments = _read_policy(file, get_device(device), trusted)
             policy = cls(**arguments)
             policy.load_state_dict(state)
+            found = policy.first_not_finite()
+            if found is not None:
+                raise ValueError(f"it is not a policy that can act: {found[0]} is {found[1]}")
             return policy.to(get_device(device))
 
     @property
@@ -538,6 +552,22 @@ class CausalGDPPolicy(BasePolicy):
             return th.cat([preprocessed[key].flatten(1) for key in self.observation_space.spaces], dim=1)
         assert isinstance(preprocessed, th.Tensor)
         return preprocessed.flatten(1)
+
+    @th.no_grad()
+    def exact_causal_state(self, observation: PyTorchObs) -> th.Tensor:
+        """
+        :meth:`causal_state` in double precision, for statistics and answers in the environment's units: far from 0, float32
+        loses a small motion.
+
+        :param observation: Observations as the environment gives them
+        :return: float64, shape ``(batch, n)``
+        """
+        if self.has_image_state:
+            return self.causal_state(observation).double()
+        if isinstance(observation, dict):
+            named = self.observation_space.spaces.items()  # type: ignore[attr-defined]
+            return th.cat([_exactly(observation[key], space) for key, space in named], dim=1)
+        return _exactly(observation, self.observation_space)
 
     def _features_of_state(self, state: th.Tensor, extractor: nn.Module) -> th.Tensor:
         """Features of predicted states, which have no observation: the inverse of :meth:`causal_state`."""
@@ -613,6 +643,52 @@ class CausalGDPPolicy(BasePolicy):
 
     # Prediction ---------------------------------------------------------------------------------------------------------
 
+    def predict(
+        self,
+        observation: np.ndarray | dict[str, np.ndarray],
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+        """
+        SB3's ``predict``, which gives no action that is not a number.
+
+        :param observation: One observation or a batch
+        :param state: Not used
+        :param episode_start: Not used
+        :param deterministic: Whether the action has no noise
+        :return: The action of each, in the environment's units, and ``state``
+        :raises ValueError: If an observation is NaN or infinite in float32, with its row and index
+        :raises TrainingDivergedError: If the policy itself gives NaN, with the first of its tensors that holds it
+        """
+        if isinstance(observation, np.ndarray):
+            if not fits_float32(observation):
+                self._refuse_observation(observation)
+        else:
+            self._check_parts(observation)
+        actions, state = super().predict(observation, state, episode_start, deterministic)
+        if not is_finite(actions):
+            self._say_what_diverged(actions)
+        return actions, state
+
+    def _check_parts(self, observation: Any) -> None:
+        for key, values in observation.items() if isinstance(observation, dict) else ((None, observation),):
+            if isinstance(values, (list, np.ndarray)) and not fits_float32(np.asarray(values)):
+                self._refuse_observation(np.asarray(values), key)
+
+    def _refuse_observation(self, values: np.ndarray, key: str | None = None) -> None:
+        space = self.observation_space if key is None else self.observation_space[key]  # type: ignore[index]
+        index = first_not_finite_index(values)
+        value = np.atleast_1d(values)[index]
+        n_axes = len(space.shape or ())
+        row = f"row {index[0]}, " if values.ndim > n_axes else ""
+        name = "The observation" if key is None else f"observation[{key!r}]"
+        raise ValueError(f"{name} is {value} at {row}index {list(index[len(index) - n_axes :])}: it must be finite in float32")
+
+    def _say_what_diverged(self, actions: np.ndarray) -> None:
+        found = self.first_not_finite()
+        raise TrainingDivergedError(*(found or ("the policy's action", float(actions[~np.isfinite(actions)][0]))))
+
     def forward(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         return self._predict(observation, deterministic=deterministic)
 
@@ -675,6 +751,12 @@ class CausalGDPPolicy(BasePolicy):
 
 def _leaf_spaces(space: spaces.Space) -> list[spaces.Space]:
     return list(space.spaces.values()) if isinstance(space, spaces.Dict) else [space]
+
+
+def _exactly(values: th.Tensor, space: spaces.Space) -> th.Tensor:
+    if not isinstance(space, spaces.Box):
+        values = preprocess_obs(values, space)  # type: ignore[assignment]
+    return values.double().flatten(1)
 
 
 def _as_observation(state: th.Tensor, space: spaces.Space) -> th.Tensor:

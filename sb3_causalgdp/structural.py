@@ -70,7 +70,7 @@ def states_of(policy: CausalGDPPolicy, observation: Any, normalizer: VecNormaliz
         observation = normalizer.normalize_obs(observation)
     policy.set_training_mode(False)
     tensor, is_batch = policy.obs_to_tensor(observation)
-    states = policy.causal_state(tensor).cpu().numpy()
+    states = policy.exact_causal_state(tensor).cpu().numpy()
     return states if is_batch else states[0]
 
 

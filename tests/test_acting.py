@@ -54,6 +54,20 @@ def both_paths(policy, observations, deterministic=False):
         return fast, policy._act_in_torch(observations, policy.actor.features(observations), noise)
 
 
+@pytest.mark.parametrize(("state_unit", "reward_unit"), [(1.0, 1e-9), (1e-6, 1.0), (0.0, 1.0), (1.0, 0.0)])
+def test_both_paths_agree_in_small_units_and_where_nothing_moves(state_unit, reward_unit):
+    policy = make_policy(guidance_target="reward")
+    model = policy.world_model
+    with th.no_grad():
+        state = state_unit * th.randn(64, N_STATES) + 0.25
+        model.n_batches.zero_()
+        model.update_statistics(state, state + 0.3 * state_unit * th.randn(64, N_STATES), reward_unit * th.randn(64) + 0.25)
+    policy.reward_target.fill_(0.25 + reward_unit)
+    fast, plain = both_paths(policy, state[:4])
+    assert np.isfinite(fast).all()
+    np.testing.assert_allclose(fast, plain, atol=2e-5)
+
+
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.skipif(not th.cuda.is_available(), reason="needs a GPU"))]
 
 

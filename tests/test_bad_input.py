@@ -99,6 +99,44 @@ def test_what_is_not_finite_is_named_and_not_stored(fault, fault_at, name, n_sto
     assert all(bool(th.isfinite(values).all()) for values in model.policy.state_dict().values())
 
 
+class DoubleEnv(FaultyEnv):
+    """Its observations and rewards are float64."""
+
+    def __init__(self, fault, value, fault_at=7, dtype=np.float64):
+        super().__init__(fault, value, fault_at)
+        self.observation_space = spaces.Box(-np.inf, np.inf, (3,), dtype)
+
+    def _observe(self, broken):
+        values = super()._observe(False).astype(np.float64)
+        if broken:
+            values[1] = self.value
+        return values
+
+
+@pytest.mark.filterwarnings("ignore:overflow encountered")
+@pytest.mark.parametrize("normalised", [False, True])
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("fault", ["observation", "reward"])
+@pytest.mark.parametrize("value", [1e39, -1e300, np.inf])
+def test_what_overflows_float32_is_not_stored(value, fault, dtype, normalised):
+    env = make_vec_env(lambda: DoubleEnv(fault, value, dtype=dtype), n_envs=1)
+    model = make(VecNormalize(env) if normalised else env)
+    with pytest.raises(ValueError, match=f"(infinite {fault}|{fault} that is infinite in float32) at step 7, index "):
+        model.learn(40)
+    buffer = model.replay_buffer
+    assert buffer.pos == 6
+    for values in (buffer.observations, buffer.next_observations, buffer.rewards):
+        assert np.abs(values).max() < 1e38
+
+
+def test_large_numbers_that_float32_holds_are_stored():
+    model = make(DoubleEnv("observation", 1e30))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        model.learn(8)
+    assert np.abs(model.replay_buffer.next_observations).max() == 1e30
+
+
 def test_the_first_observation_is_looked_at_too():
     model = make(FaultyEnv("reset", fault_at=0))
     with pytest.raises(ValueError, match=r"NaN or infinite observation at step 0, index \[0, 1\]"):

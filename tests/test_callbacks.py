@@ -183,6 +183,51 @@ def test_an_own_discovery_method_sees_moments_and_the_last_graph_and_its_masks_a
     assert bool((model.world_model.state_to_state == 0.5).all())
 
 
+def test_a_window_that_is_too_short_for_the_discovery_is_refused_at_construction():
+    with pytest.raises(ValueError, match="window=8 and half_life=None keep as few as 8 rows, and discovery needs 12"):
+        make(causal_window=8)
+    with pytest.raises(ValueError, match=r"half_life=5\.0 keep as few as 8 rows"):
+        make(causal_half_life=5.0)
+    make(causal_window=16).learn(128, callback=RecordingCallback())
+
+
+class ManyNumbers(gym.Env):
+    """An observation of 700 numbers, more than the default features have memory for."""
+
+    observation_space = gym.spaces.Box(-9.0, 9.0, (700,))
+    action_space = gym.spaces.Box(-1.0, 1.0, (1,))
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return self.np_random.normal(size=700).astype(np.float32), {}
+
+    def step(self, action):
+        return self.np_random.normal(size=700).astype(np.float32), 0.0, False, False, {}
+
+
+def test_hundreds_of_observations_are_discovered_with_simpler_features_and_the_saved_graph_says_so(tmp_path):
+    model = make(env=ManyNumbers(), learning_starts=2_000, buffer_size=2_000, policy_kwargs={"world_model_net_arch": [4, 4]})
+    model.learn(1_500, callback=CausalWorldModelCallback(refresh_freq=1_420, min_transitions=1_406))
+    assert model.causal_graph().remarks[0].endswith("found with basis='linear'")
+    model.save(tmp_path / "model")
+    assert CausalGDP.load(tmp_path / "model").causal_graph().remarks == model.causal_graph().remarks
+
+
+def test_statistics_that_started_anew_wait_for_rows_instead_of_raising(tmp_path):
+    """A loaded model without its buffer, whose observations have another scale all at once."""
+    model = make()
+    model.learn(128, callback=RecordingCallback())
+    model.save(tmp_path / "model")
+    scaled = gym.wrappers.TransformObservation(gym.make("Pendulum-v1"), lambda observation: 500.0 * observation, None)
+    scaled.observation_space = gym.spaces.Box(-np.inf, np.inf, (3,))
+    model = CausalGDP.load(tmp_path / "model")
+    model.observation_space = scaled.observation_space
+    model.set_env(scaled)
+    with pytest.warns(UserWarning, match="Causal discovery waits: it has 3 transitions and needs 20"):
+        model.learn(6, callback=RecordingCallback(refresh_freq=3), reset_num_timesteps=False)
+    assert model.causal_graph().num_timesteps == 129
+
+
 def test_a_half_life_makes_old_transitions_weigh_less():
     model = make(causal_half_life=20.0)
     model.learn(128, callback=RecordingCallback())
@@ -214,6 +259,7 @@ TAGS = {
     "guidance/step_size",
     "guidance/step_size_bound",
     "train/actor_loss",
+    "train/bound_loss",
     "train/critic_loss",
     "train/denoising_loss",
     "train/learning_rate",

@@ -136,7 +136,7 @@ def test_recordings_that_keep_changing_do_not_pile_up():
 
 @pytest.mark.parametrize("value", ["yes", 1, None])
 def test_other_values_are_refused(value):
-    with pytest.raises(ValueError, match="cuda_graph must be True, False or 'auto'"):
+    with pytest.raises(ValueError, match="cuda_graph must be True or False or 'auto'"):
         CausalGDP("MlpPolicy", "Pendulum-v1", cuda_graph=value)
 
 

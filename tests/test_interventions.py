@@ -7,7 +7,7 @@ from gymnasium import spaces
 from stable_baselines3.common.envs import FakeImageEnv
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from sb3_causalgdp import CausalGDP
+from sb3_causalgdp import CausalGDP, CausalWorldModelCallback
 
 KWARGS = {
     "learning_starts": 30,
@@ -52,6 +52,45 @@ def play(env, n_steps=12, seed=0):
         actions.append(action)
         rewards.append(reward)
     return observations, actions, rewards
+
+
+class FarPendulum(gym.ObservationWrapper):
+    """Pendulum far from 0, in a dictionary perhaps."""
+
+    def __init__(self, offset, in_dictionary=False):
+        super().__init__(gym.make("Pendulum-v1"))
+        self.offset, self.in_dictionary = offset, in_dictionary
+        box = spaces.Box(-np.inf, np.inf, (3,), np.float64)
+        self.observation_space = spaces.Dict({"far": box, "side": spaces.Discrete(2)}) if in_dictionary else box
+
+    def observation(self, observation):
+        far = observation.astype(np.float64) + self.offset
+        return {"far": far, "side": int(observation[1] > 0.0)} if self.in_dictionary else far
+
+
+@pytest.mark.parametrize("in_dictionary", [False, True])
+def test_far_from_zero_nothing_is_lost_on_the_way(in_dictionary):
+    policy = "MultiInputPolicy" if in_dictionary else "MlpPolicy"
+    env = VecNormalize(
+        DummyVecEnv([lambda: FarPendulum(5e6, in_dictionary)]), norm_obs_keys=["far"] if in_dictionary else None
+    )
+    model = learn(env, policy)
+    observations, actions, rewards = play(FarPendulum(5e6, in_dictionary))
+    far = np.stack([one["far"] if in_dictionary else one for one in observations])
+    counterfactual = model.counterfactual((observations, actions, rewards), {})
+    np.testing.assert_array_equal(counterfactual.states[:, :3], far)
+    buffer = model.replay_buffer
+    stored = buffer.observations["far"] if in_dictionary else buffer.observations
+    (rows,) = CausalWorldModelCallback._rows_at(_with(model), buffer, np.arange(100))
+    np.testing.assert_array_equal(rows[:, :3], stored[:100, 0])
+    if in_dictionary:
+        np.testing.assert_array_equal(rows[:, 3:5], np.eye(2)[buffer.observations["side"][:100, 0].ravel()])
+
+
+def _with(model):
+    callback = CausalWorldModelCallback()
+    callback.model = model
+    return callback
 
 
 @pytest.fixture(scope="module")

@@ -13,14 +13,25 @@ LAYERS = [
     {"__init__"},
     {"causalgdp"},
     {"callbacks", "checkpoints"},
-    {"losses", "gradients", "diagnostics", "structural", "device_replay", "cuda_graphs", "files"},
+    {"losses", "gradients", "diagnostics", "structural", "device_replay", "cuda_graphs"},
     {"product_pass"},
     {"policies"},
-    {"acting", "saved"},
+    {"acting", "arguments", "saved"},
     {"causal", "offline", "diffusion"},
-    {"checks", "files", "products", "activations", "plain", "archives"},
+    {"checks", "divergence", "files", "products", "activations", "plain", "archives"},
 ]
-WITHOUT_SB3 = {"causal", "diffusion", "losses", "gradients", "products", "product_pass", "activations", "cuda_graphs"}
+WITHOUT_SB3 = {
+    "causal",
+    "diffusion",
+    "divergence",
+    "files",
+    "losses",
+    "gradients",
+    "products",
+    "product_pass",
+    "activations",
+    "cuda_graphs",
+}
 LEVELS = {part: level for level, parts in enumerate(LAYERS) for part in parts}
 FILES = sorted(PACKAGE.rglob("*.py"))
 

@@ -113,5 +113,5 @@ def test_rates_and_schedules_survive_saving_and_new_ones_take_effect():
     "rate", [-1e-3, float("inf"), float("nan"), lambda progress: -progress], ids=["negative", "infinite", "nan", "schedule"]
 )
 def test_rates_that_make_no_sense_are_refused_at_once(name, rate):
-    with pytest.raises(ValueError, match=f"{name} must be a finite number of at least 0"):
+    with pytest.raises(ValueError, match=f"^{name} must be a number from 0 to "):
         make(**{name: rate})

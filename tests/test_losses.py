@@ -4,7 +4,8 @@ import pytest
 import torch as th
 
 from sb3_causalgdp.causal import MaskedWorldModel
-from sb3_causalgdp.diffusion import GuidanceRule, NoiseSchedule
+from sb3_causalgdp.diffusion import GuidanceRule, NoiseSchedule, sample
+from sb3_causalgdp.diffusion.bounds import bounded, outside
 from sb3_causalgdp.losses import critic_loss, denoising_loss, q_loss, quantile, td_target, world_model_loss
 
 SCHEDULE = NoiseSchedule("vp", 5)
@@ -145,6 +146,72 @@ def test_q_term_does_not_climb_by_its_scale():
 
 def test_critics_at_zero_give_a_finite_q_term():
     assert math.isfinite(q_loss(column(1.0, 1.0), column(0.0, 0.0)).item())
+
+
+def test_the_scale_of_advantages_does_not_see_what_all_actions_have_in_common():
+    values, others, of_data = column(3.0, 5.0), column(2.0, 6.0), column(1.0, 8.0)
+    loss = q_loss(values, others, of_data)
+    assert loss.item() == pytest.approx(-4.0 / 1.5)
+    gradients = []
+    for level in (0.0, 1e4):
+        actor_values = column(3.0, 5.0).requires_grad_()
+        q_loss(actor_values + level, others + level, of_data + level).backward()
+        gradients.append(actor_values.grad)
+    th.testing.assert_close(*gradients)
+
+
+def test_actions_that_make_no_difference_give_a_finite_gradient():
+    values = column(100.0, 100.0).requires_grad_()
+    q_loss(values, column(100.0, 100.0), column(100.0, 100.0)).backward()
+    assert values.grad.abs().max() < 1e4
+
+
+# Bounds -----------------------------------------------------------------------------------------------------------------
+
+
+def test_the_gradient_of_the_q_term_leads_back_inside_and_not_further_out():
+    # Far out on either side, for a Q that wants them inside, and for one that wants them further out
+    for wanted, moves in ((0.0, True), (9.0, False)):
+        said = th.tensor([[3.0, -3.0]]).requires_grad_()
+        sign = th.tensor([[1.0, -1.0]])
+        (bounded(said) - wanted * sign).square().sum().backward()
+        assert (said.grad != 0.0).all().item() is moves
+        if moves:
+            assert ((said - 0.1 * said.grad).abs() < 3.0).all()
+
+
+def test_inside_the_bounds_the_gradient_is_that_of_the_action():
+    action = th.tensor([0.5, -1.0, 1.0]).requires_grad_()
+    (bounded(action) * th.tensor([2.0, -3.0, 4.0])).sum().backward()
+    assert action.grad.tolist() == [2.0, -3.0, 4.0]
+    assert bounded(th.tensor([2.0, -0.5]), 1.5).tolist() == [1.5, -0.5]
+    assert bounded(th.tensor([2.0]), None).tolist() == [2.0]
+
+
+@pytest.mark.parametrize("part", ["one step", "chain"])
+def test_a_policy_that_is_stuck_outside_is_brought_back_by_its_critic(part):
+    """With a plain clamp its parameters would not move."""
+    bias = th.full((2,), -20.0).requires_grad_()
+    optimizer = th.optim.Adam([bias], lr=0.5)
+
+    def denoiser(noisy, step, condition):
+        return noisy + bias
+
+    for _ in range(200):
+        if part == "one step":
+            actions = denoising_loss(denoiser, SCHEDULE, th.zeros(32, 1), th.rand(32, 2) * 2 - 1).clean_actions
+        else:
+            actions = sample(denoiser, SCHEDULE, th.zeros(32, 1), action_dim=2)
+        optimizer.zero_grad()
+        (actions + 0.5).square().mean().backward()
+        optimizer.step()
+    assert (actions.mean(dim=0) + 0.5).abs().max() < 0.3
+
+
+def test_what_lies_outside_is_penalised_by_its_squared_distance():
+    assert outside(th.tensor([[0.5, 1.0], [-3.0, 2.0]])).item() == pytest.approx((4.0 + 1.0) / 4)
+    terms = denoising_loss(lambda noisy, step, condition: 100.0 + 0.0 * noisy, SCHEDULE, th.zeros(64, 1), th.zeros(64, 2))
+    assert terms.clean_actions.abs().max() <= 1.0 and terms.outside > 1e3
 
 
 # World model ------------------------------------------------------------------------------------------------------------

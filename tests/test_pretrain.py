@@ -13,6 +13,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_causalgdp import CausalGDP, CausalWorldModelCallback
+from sb3_causalgdp.causal.sources import open_source as open_causal_source
 from sb3_causalgdp.offline.sources import Source
 
 KWARGS = {
@@ -30,6 +31,10 @@ GOAL_KEYS = ("observation", "achieved_goal", "desired_goal")
 
 def make(env="Pendulum-v1", **kwargs):
     return CausalGDP("MlpPolicy", env, **{**KWARGS, **kwargs})
+
+
+def make_hindsight(env, **kwargs):
+    return CausalGDP("MultiInputPolicy", env, replay_buffer_class=HerReplayBuffer, **{**KWARGS, **kwargs})
 
 
 @pytest.fixture(scope="module")
@@ -370,6 +375,104 @@ def test_hindsight_replay_takes_preloaded_batches_until_an_episode_has_ended(tmp
     assert loaded.offline_buffer.size() == 60
 
 
+@pytest.mark.parametrize("learns_from_the_start", [False, True])
+def test_hindsight_replay_waits_for_the_end_of_an_episode(learns_from_the_start, tmp_path):
+    model = make_hindsight(GoalEnv(20))
+    if not learns_from_the_start:
+        model.learn(60)
+        model.save(tmp_path / "model")
+        model = CausalGDP.load(tmp_path / "model", env=GoalEnv(20), device="cpu")
+    before = model._n_updates
+    with pytest.warns(UserWarning, match="Updates wait: HerReplayBuffer holds no whole episode yet"):
+        model.learn(30, reset_num_timesteps=False)
+    assert model._n_updates - before == 30 - 20 + 1
+
+
+def test_hindsight_replay_of_another_number_of_environments_is_put_into_as_many_columns(tmp_path):
+    model = make_hindsight(make_vec_env(GoalEnv, 3, env_kwargs={"episode_length": 7}))
+    recorded = make_hindsight(GoalEnv(7), learning_starts=100).learn(49)
+    model.preload(recorded.replay_buffer).learn(60)
+    model.save(tmp_path / "model")
+    model.save_replay_buffer(tmp_path / "buffer")
+    loaded = CausalGDP.load(tmp_path / "model", env=GoalEnv(7), device="cpu")
+    loaded.load_replay_buffer(tmp_path / "buffer")
+    online, offline = loaded.replay_buffer, loaded.offline_buffer
+    assert (online.n_envs, online.size(), offline.n_envs, offline.size()) == (1, 60, 1, 51)
+    assert (online.ep_length[:60] > 0).all() and online.ep_length.max() == 7
+    loaded.learn(20, reset_num_timesteps=False)
+
+
+# Normalised observations ---------------------------------------------------------------------------------------------------
+
+
+def normalising(**kwargs):
+    return VecNormalize(make_vec_env("Pendulum-v1"), **kwargs)
+
+
+def test_a_resumed_training_counts_the_dataset_once_in_vec_normalize(npz, tmp_path):
+    model = make(env=normalising(), offline_dataset=npz)
+    for _ in range(3):
+        model.learn(20, reset_num_timesteps=False)
+        model.save(tmp_path / "model")
+        model.env.save(tmp_path / "normalize.pkl")
+        env = VecNormalize.load(tmp_path / "normalize.pkl", make_vec_env("Pendulum-v1"))
+        n_counted, returns = env.obs_rms.count, env.ret_rms.count
+        model = CausalGDP.load(tmp_path / "model", env=env, device="cpu")
+    model.preload(npz)
+    assert (env.obs_rms.count, env.ret_rms.count) == (n_counted, returns)
+    assert N_ROWS + 60 <= n_counted <= N_ROWS + 70
+    # A fresh one has not counted it, and other transitions are others
+    fresh = normalising()
+    model = CausalGDP.load(tmp_path / "model", env=fresh, device="cpu").preload(npz)
+    assert round(fresh.obs_rms.count) == N_ROWS
+    model.preload({key: values[:100] for key, values in np.load(npz).items()})
+    assert round(fresh.obs_rms.count) == N_ROWS + 100
+
+
+def test_vec_normalize_that_comes_after_the_dataset_gets_its_statistics(arrays):
+    model = CausalGDP.from_dataset(Described(arrays, gym.make("Pendulum-v1").observation_space), **KWARGS)
+    model.preload(Described(arrays, gym.make("Pendulum-v1").observation_space))
+    before, after = normalising(), normalising()
+    make(env=before).preload(arrays)
+    model.set_env(after)
+    np.testing.assert_array_equal(before.obs_rms.mean, after.obs_rms.mean)
+    np.testing.assert_array_equal(before.ret_rms.var, after.ret_rms.var)
+    model.set_env(after)
+    assert before.obs_rms.count == after.obs_rms.count
+    model = make(reward_transform="antmaze").preload(arrays)
+    with pytest.raises(ValueError, match="VecNormalize scales the rewards already"):
+        model.set_env(normalising())
+    model.set_env(normalising(norm_reward=False))
+
+
+def test_a_policy_that_was_trained_on_raw_observations_is_not_given_normalised_ones(model, tmp_path):
+    model.pretrain(3)
+    model.save(tmp_path / "model")
+    raw = model.env
+    message = r"trained on raw observations, and this VecNormalize would give it .* normalised: pass norm_obs=False to it"
+    with pytest.raises(ValueError, match=message):
+        model.set_env(normalising())
+    assert model.env is raw and model._vec_normalize_env is None
+    with pytest.raises(ValueError, match=message):
+        CausalGDP.load(tmp_path / "model", env=normalising(), device="cpu")
+    model.set_env(normalising(norm_obs=False))
+    model.learn(20)
+
+
+@pytest.mark.filterwarnings("error:The policy was trained on")
+def test_a_policy_that_was_trained_on_normalised_observations_says_so_where_they_are_raw(arrays, tmp_path):
+    model = make(env=normalising()).preload(arrays).pretrain(3)
+    model.save(tmp_path / "model")
+    for env in (normalising(), None):
+        CausalGDP.load(tmp_path / "model", env=env, device="cpu")
+    message = r"trained on observations with \['observation'\] normalised, and this environment gives it raw observations"
+    for env in (make_vec_env("Pendulum-v1"), normalising(norm_obs=False)):
+        with pytest.warns(UserWarning, match=message):
+            model.set_env(env)
+    with pytest.warns(UserWarning, match=message):
+        CausalGDP.load(tmp_path / "model", env=gym.make("Pendulum-v1"), device="cpu")
+
+
 # From the constructor, as a YAML file says it ----------------------------------------------------------------------
 
 
@@ -425,7 +528,7 @@ def test_without_guidance_the_actor_minimises_the_loss_of_diffusion_ql(eta, arra
     model = make(eta=eta, guidance=None, denoising_weight=1.0).preload(arrays).pretrain(3)
     assert model.causal_graph().method != "none" and not model.policy.is_guided
     values = model.logger.name_to_value
-    expected = values["train/denoising_loss"] + eta * values["train/q_loss"]
+    expected = values["train/denoising_loss"] + eta * values["train/q_loss"] + 0.1 * values["train/bound_loss"]
     assert values["train/actor_loss"] == pytest.approx(expected, rel=1e-5)
 
 
@@ -439,3 +542,21 @@ def test_without_guidance_the_world_model_does_not_move_the_actor(arrays):
         model.pretrain(3)
         actors.append(list(model.actor.parameters()))
     assert_same(*actors)
+
+
+@pytest.mark.parametrize("has_learned", [False, True])
+def test_a_saved_buffer_brings_its_preloaded_part_wherever_it_is_read(has_learned, arrays, tmp_path):
+    model = make(env=make_vec_env("Pendulum-v1", n_envs=2)).preload(arrays)
+    if has_learned:
+        model.learn(80)
+    n_online = 80 if has_learned else 0
+    model.save_replay_buffer(tmp_path / "buffer")
+    n_preloaded = model.offline_buffer.size() * 2
+    other = make().preload(tmp_path / "buffer.pkl")
+    assert other.offline_buffer.size() == n_preloaded + n_online
+    half = n_preloaded // 2
+    np.testing.assert_array_equal(other.offline_buffer.actions[:half, 0], model.offline_buffer.actions[:half, 0])
+    source = open_causal_source(tmp_path / "buffer.pkl")
+    rows = np.concatenate(list(source.batches(7)))
+    assert source.n_rows == len(rows) == n_preloaded + n_online
+    np.testing.assert_array_equal(np.sort(rows[:, -1]), np.sort(other.offline_buffer.rewards[: len(rows), 0]))

@@ -2,6 +2,7 @@ import inspect
 import io
 import json
 import os
+import pickle
 import subprocess
 import sys
 import zipfile
@@ -67,8 +68,8 @@ class PlaneEnv(gym.Env):
         return self.observation_space.sample(), -float(np.square(action).sum()), False, False, {}
 
 
-def train(total_timesteps=250, **kwargs):
-    model = CausalGDP("MlpPolicy", "Pendulum-v1", **{**KWARGS, **kwargs})
+def train(total_timesteps=250, env="Pendulum-v1", **kwargs):
+    model = CausalGDP("MlpPolicy", env, **{**KWARGS, **kwargs})
     return model.learn(total_timesteps, callback=RecordingCallback())
 
 
@@ -212,6 +213,8 @@ ARGUMENTS = {
     "eta": 0.5,
     "denoising_weight": 0.7,
     "actor_update": "chain",
+    "q_scale": "value",
+    "bound_penalty": 0.2,
     "policy_delay": 3,
     "world_model_delay": 4,
     "max_q_backup": True,
@@ -434,6 +437,111 @@ def test_a_model_loads_without_environment_and_for_another_number_of_environment
     assert [refresh[0] for refresh in callback.refreshes] == [301]
 
 
+# Loading a replay buffer ------------------------------------------------------------------------------------------------
+
+
+def transitions_of(buffer):
+    """Sorted rows of observation, action, reward, next observation and whether the episode terminated."""
+    rows = slice(0, buffer.size())
+    terminations = buffer.dones * (1.0 - buffer.timeouts)
+    parts = (buffer.observations, buffer.actions, buffer.rewards, buffer.next_observations, terminations)
+    stacked = np.concatenate([part[rows].reshape(buffer.size() * buffer.n_envs, -1) for part in parts], axis=1)
+    return {tuple(row) for row in stacked.tolist()}
+
+
+@pytest.mark.parametrize(("n_saved", "n_envs"), [(1, 4), (4, 1), (3, 2), (2, 3)])
+@pytest.mark.parametrize("n_steps", [1, 3])
+@pytest.mark.parametrize("buffer_size", [150, 1000])
+def test_a_buffer_of_another_number_of_environments_is_put_into_as_many_columns(
+    n_saved, n_envs, n_steps, buffer_size, tmp_path
+):
+    model = train(150 * n_saved + 250, env=make_vec_env("Pendulum-v1", n_saved), n_steps=n_steps, buffer_size=buffer_size)
+    model.save(tmp_path / "model")
+    model.save_replay_buffer(tmp_path / "buffer")
+    loaded = CausalGDP.load(tmp_path / "model", env=make_vec_env("Pendulum-v1", n_envs), device="cpu")
+    loaded.load_replay_buffer(tmp_path / "buffer")
+    assert type(loaded.replay_buffer) is type(model.replay_buffer) and loaded.replay_buffer.n_envs == n_envs
+    assert transitions_of(loaded.replay_buffer) == transitions_of(model.replay_buffer)
+    buffer = loaded.replay_buffer
+    is_followed = buffer.dones[: buffer.size() - 1] == 0.0
+    after, now = buffer.next_observations[: buffer.size() - 1], buffer.observations[1 : buffer.size()]
+    np.testing.assert_array_equal(after[is_followed], now[is_followed])
+    assert buffer.dones[buffer.size() - 1].all()
+    loaded.learn(120, reset_num_timesteps=False)
+    assert loaded.replay_buffer is buffer and np.isfinite(loaded.causal_statistics.raw.mean).all()
+
+
+def test_a_memory_efficient_buffer_needs_the_number_of_environments_that_it_was_saved_with(tmp_path):
+    kwargs = {"optimize_memory_usage": True, "replay_buffer_kwargs": {"handle_timeout_termination": False}}
+    model = train(env=make_vec_env("Pendulum-v1", 2), **kwargs)
+    model.save(tmp_path / "model")
+    model.save_replay_buffer(tmp_path / "buffer")
+    loaded = CausalGDP.load(tmp_path / "model", env=make_vec_env("Pendulum-v1", 3), device="cpu")
+    with pytest.raises(ValueError, match=r"transitions of 2 environments, and the model has 3, .* load the model with 2"):
+        loaded.load_replay_buffer(tmp_path / "buffer")
+    assert loaded.replay_buffer.n_envs == 3 and loaded.replay_buffer.size() == 0
+
+
+def test_exploration_noise_follows_the_number_of_environments(tmp_path):
+    noise = NormalActionNoise(np.zeros(1), 0.1 * np.ones(1))
+    train(60, env=make_vec_env("Pendulum-v1", 2), action_noise=noise).save(tmp_path / "model")
+    for n_envs in (3, 1):
+        loaded = CausalGDP.load(tmp_path / "model", env=make_vec_env("Pendulum-v1", n_envs), device="cpu")
+        loaded.learn(60, reset_num_timesteps=False)
+        assert loaded.action_noise.n_envs == n_envs
+
+
+@pytest.mark.parametrize("field", ["observations", "next_observations", "actions", "rewards"])
+def test_a_replay_buffer_with_a_nan_is_refused_and_the_model_keeps_its_own(trained, saved, field, tmp_path):
+    with (saved / "buffer.pkl").open("rb") as file:
+        buffer = pickle.load(file)
+    getattr(buffer, field)[7, 0] = np.nan
+    with (tmp_path / "buffer.pkl").open("wb") as file:
+        pickle.dump(buffer, file)
+    loaded = CausalGDP.load(saved / "model.zip", device="cpu")
+    own = loaded.replay_buffer
+    with pytest.raises(
+        ValueError, match=rf"buffer\.pkl has a NaN or infinite value in {field}.* at position 7 of environment 0"
+    ):
+        loaded.load_replay_buffer(tmp_path / "buffer.pkl")
+    assert loaded.replay_buffer is own and loaded.offline_buffer is None
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda buffer: buffer.dones.__setitem__((3, 0), 0.5), "dones must be bool, or 0 and 1, got 0.5 at transition 3"),
+        (lambda buffer: setattr(buffer, "rewards", buffer.rewards[:9]), r"rewards have the shape \(9, 1\), and \(1000, 1\)"),
+        (lambda buffer: setattr(buffer, "pos", 1000), "its position is 1000, and its size 1000"),
+    ],
+)
+def test_a_damaged_replay_buffer_is_refused(saved, change, message, tmp_path):
+    with (saved / "buffer.pkl").open("rb") as file:
+        buffer = pickle.load(file)
+    change(buffer)
+    with (tmp_path / "buffer.pkl").open("wb") as file:
+        pickle.dump(buffer, file)
+    with pytest.raises(ValueError, match=message):
+        CausalGDP.load(saved / "model.zip", device="cpu").load_replay_buffer(tmp_path / "buffer.pkl")
+
+
+@pytest.mark.parametrize(
+    ("env", "message"),
+    [
+        (
+            lambda: PlaneEnv(4),
+            r"its observation space is Box\(.*\(3,\), float32\), and the model's is Box\(.*\(4,\), float32\)",
+        ),
+        (lambda: PlaneEnv(3, 2), r"its action space is Box\(.*\(1,\), float32\), and the model's is Box\(.*\(2,\), float32\)"),
+        (lambda: PlaneEnv(3, 1), r"its action space is Box\(-2\.0, .*, and the model's is Box\(-1\.0"),
+    ],
+)
+def test_the_replay_buffer_of_another_environment_is_refused(saved, env, message):
+    model = CausalGDP("MlpPolicy", env(), **KWARGS)
+    with pytest.raises(ValueError, match=message):
+        model.load_replay_buffer(saved / "buffer.pkl")
+
+
 def test_arguments_and_custom_objects_replace_what_was_saved(saved):
     model = CausalGDP.load(
         saved / "model.zip",
@@ -483,7 +591,7 @@ def test_parameters_of_another_shape_are_refused(saved, tmp_path):
     with pytest.raises(ValueError, match="policy kwargs do not equal"):
         CausalGDP.load(saved / "model.zip", device="cpu", policy_kwargs={"net_arch": [8]})
     (tmp_path / "broken.zip").write_bytes((saved / "model.zip").read_bytes()[:1000])
-    with pytest.raises(ValueError, match="broken.zip cannot be loaded: BadZipFile"):
+    with pytest.raises(ValueError, match=r"broken\.zip cannot be loaded: BadZipFile"):
         CausalGDP.load(tmp_path / "broken.zip", device="cpu")
 
 

@@ -237,6 +237,7 @@ def summary_of(graph: CausalGraph, source: TransitionSource) -> str:
     if graph.duplicated_variables:
         groups = [" = ".join(group) for group in graph.duplicated_variables]
         lines.append(f"linearly dependent, share their masks: {_shortened(groups)}")
+    lines += [f"remark: {remark}" for remark in graph.remarks]
     return "\n".join(lines)
 
 

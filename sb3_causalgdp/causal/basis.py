@@ -132,6 +132,42 @@ def number_of_features(n_inputs: int, basis: str) -> int:
     return N_FUNCTIONS * n_inputs + (n_inputs * (n_inputs - 1) // 2 if basis == "products" else 0)
 
 
+def bytes_needed(n_states: int, n_inputs: int, basis: str) -> int:
+    """
+    :param n_states: Number n of states
+    :param n_inputs: Number p of states and actions
+    :param basis: ``"linear"``, ``"additive"`` or ``"products"``
+    :return: bytes of the moments of the features of (s, a) and of (s', a), in two blocks, the fewest
+    """
+    n_features = number_of_features(n_inputs, basis)
+    return 2 * 8 * n_features * (2 * n_features + n_states + 1)
+
+
+def affordable_basis(n_states: int, n_inputs: int, max_memory: float) -> tuple[str, str]:
+    """
+    :param n_states: Number n of states
+    :param n_inputs: Number p of states and actions
+    :param max_memory: Bytes that the moments may take
+    :return: the richest features that ``basis="auto"`` may take, ``"linear"`` where none fits; and a remark, empty unless it
+        is the memory that decides
+    """
+    preferred = "products" if n_inputs <= MOST_INPUTS_WITH_PRODUCTS else "additive"
+    basis = preferred
+    while basis != "linear" and bytes_needed(n_states, n_inputs, basis) > max_memory:
+        basis = "additive" if basis == "products" else "linear"
+    if basis == preferred:
+        return basis, ""
+    return basis, f"{_shortage(n_states, n_inputs, preferred, max_memory)}: found with basis={basis!r}"
+
+
+def _shortage(n_states: int, n_inputs: int, basis: str, max_memory: float) -> str:
+    needed = bytes_needed(n_states, n_inputs, basis)
+    return (
+        f"{number_of_features(n_inputs, basis)} features of {n_inputs} states and actions need {needed / 1e6:.0f} MB, "
+        f"and max_memory is {max_memory / 1e6:.0f} MB"
+    )
+
+
 def _bounded(standardised: np.ndarray) -> np.ndarray:
     return np.clip(standardised, -FEATURE_BOUND, FEATURE_BOUND)
 
@@ -148,8 +184,8 @@ class BasisMoments:
     :param half_life: Number of new rows after which an old row weighs half; None weighs all alike
     :param window: Number of newest rows that are kept; None keeps all
     :param basis: The features, see :class:`BasisExpansion`; ``"auto"`` is ``"products"`` where states and actions are at most
-        60, else ``"additive"``
-    :param max_memory: Bytes that the moments may take; fewer blocks are kept where 8 of them need more
+        60, else ``"additive"``, or the next simpler ones where ``max_memory`` is too small for these
+    :param max_memory: Bytes that the features' moments may take; fewer blocks are kept where 8 of them need more
     :raises ValueError: when two blocks need more memory than that
     """
 
@@ -157,6 +193,8 @@ class BasisMoments:
     LARGEST_SHIFT = 3.0
     MAX_BLOCKS = 8
     RECENT_ROWS = 256
+    remark = ""
+    """What was simplified to keep within the memory; empty where nothing was."""
 
     def __init__(
         self,
@@ -170,17 +208,13 @@ class BasisMoments:
         self.variables = variables
         self.basis = basis
         if basis == "auto":
-            self.basis = "products" if n_inputs <= MOST_INPUTS_WITH_PRODUCTS else "additive"
+            self.basis, self.remark = affordable_basis(n_states, n_inputs, max_memory)
         self.raw = StreamingMoments(variables.n_variables, half_life, variables.names, window)
         n_features = number_of_features(n_inputs, self.basis)
-        block_bytes = 8 * n_features * (2 * n_features + n_states + 1)
-        n_blocks = min(self.MAX_BLOCKS, 2 * int(max_memory // (2 * block_bytes)))
+        n_blocks = min(self.MAX_BLOCKS, 2 * int(max_memory // bytes_needed(n_states, n_inputs, self.basis)))
         if n_blocks < 2:
             simpler = {"products": "use basis='additive', or ", "additive": "use basis='linear', or "}.get(self.basis, "")
-            raise ValueError(
-                f"{n_features} features of {n_inputs} states and actions need {2 * block_bytes / 1e6:.0f} MB, "
-                f"and max_memory is {max_memory / 1e6:.0f} MB: {simpler}give it more memory"
-            )
+            raise ValueError(f"{_shortage(n_states, n_inputs, self.basis, max_memory)}: {simpler}give it more memory")
         self.dynamics, self.reward = (
             StreamingMoments(n_features + n_targets, half_life, window=window, n_blocks=n_blocks, n_targets=n_targets)
             for n_targets in (n_states, 1)
@@ -196,6 +230,16 @@ class BasisMoments:
     def n_samples(self) -> int:
         """Number of rows that have been fed."""
         return self.raw.n_samples
+
+    @property
+    def count(self) -> float:
+        """Sum of the weights of the rows from which a graph is found."""
+        return self.raw.count if self.expansions is None else self.dynamics.count
+
+    @property
+    def fewest_rows(self) -> float:
+        """Sum of the rows' weights that is not fallen below once rows are forgotten."""
+        return min(self.raw.fewest_rows, self.dynamics.fewest_rows)
 
     def update(self, rows: npt.ArrayLike) -> None:
         """

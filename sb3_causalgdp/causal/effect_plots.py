@@ -2,7 +2,7 @@ import os
 
 import numpy as np
 
-from sb3_causalgdp.causal.figures import FONT_SIZE, INCHES_PER_CHARACTER, save_figure
+from sb3_causalgdp.causal.figures import AS_TEXT, FONT_SIZE, INCHES_PER_CHARACTER, save_figure
 from sb3_causalgdp.causal.graph import PLOTS_HINT
 from sb3_causalgdp.causal.interventions import ActionEffects
 
@@ -88,7 +88,7 @@ def plot_reward_effects(effects: ActionEffects, axes: Axes | None = None, max_ac
     # Few bars stay slim
     margin = 0.6 + max(4 - len(shown), 0) / 2
     axes.set_ylim(len(shown) - 1 + margin, -margin)
-    axes.set_yticks(rows, [effects.variables.action_names[i] for i in shown], fontsize=FONT_SIZE)
+    axes.set_yticks(rows, [effects.variables.action_names[i] for i in shown], fontsize=FONT_SIZE, **AS_TEXT)
     axes.tick_params(axis="x", labelsize=FONT_SIZE)
     axes.tick_params(axis="y", length=0)
     axes.grid(axis="x", color="0.9")
@@ -150,8 +150,8 @@ def plot_next_state_effects(
             colour = "white" if abs(value) > 0.6 * largest else "black"
             axes.text(column, row, f"{value:.{decimals}f}", ha="center", va="center", fontsize=FONT_SIZE - 1.5, color=colour)
     names = [variables.action_names[i] for i in actions]
-    axes.set_xticks(range(len(actions)), names, rotation=0 if len(actions) == 1 else 90, fontsize=FONT_SIZE)
-    axes.set_yticks(range(len(states)), [variables.next_state_names[j] for j in states], fontsize=FONT_SIZE)
+    axes.set_xticks(range(len(actions)), names, rotation=0 if len(actions) == 1 else 90, fontsize=FONT_SIZE, **AS_TEXT)
+    axes.set_yticks(range(len(states)), [variables.next_state_names[j] for j in states], fontsize=FONT_SIZE, **AS_TEXT)
     axes.set_xticks(np.arange(len(actions) + 1) - 0.5, minor=True)
     axes.set_yticks(np.arange(len(states) + 1) - 0.5, minor=True)
     axes.grid(which="minor", color="white", linewidth=1)

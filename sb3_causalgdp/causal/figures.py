@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Sequence
+from typing import Any
 
 from sb3_causalgdp.causal.graph import PLOTS_HINT
 from sb3_causalgdp.files import replaced_when_done
@@ -17,6 +18,8 @@ FONT_SIZE = 9
 INCHES_PER_CHARACTER = 0.095  # at FONT_SIZE, on the generous side
 ROW_INCHES = 0.34
 DPI = 120
+AS_TEXT: dict[str, Any] = {"parse_math": False}
+"""Of the texts with names of variables, in which a dollar sign is one."""
 
 
 def label_inches(variables: TransitionVariables) -> float:

@@ -84,6 +84,7 @@ class CausalGraph:
     :param duplicated_variables: Groups of names that are linear functions of each other; a group shares its masks
     :param num_timesteps: Environment steps when it was found
     :param found_at: ISO 8601 time when it was found
+    :param remarks: What else limits it, such as features that were left out for want of memory
     :raises ValueError: when a shape does not fit, a value is not finite, a mask is outside [0, 1], a name is not that of a
         variable, or a number of samples or steps is not a whole one
     """
@@ -100,6 +101,7 @@ class CausalGraph:
     duplicated_variables: tuple[tuple[str, ...], ...] = ()
     num_timesteps: int | None = None
     found_at: str | None = None
+    remarks: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         n_states, n_actions = self.variables.n_states, self.variables.n_actions
@@ -114,6 +116,9 @@ class CausalGraph:
         if self.standard_errors is not None and self.standard_errors.min() < 0:
             raise ValueError(f"standard_errors must be at least 0, got {self.standard_errors.min():g}")
         self._check_scalars()
+        if isinstance(self.remarks, str) or not all(isinstance(remark, str) for remark in self.remarks):
+            raise ValueError(f"remarks must be strings, got {self.remarks!r}")
+        self.remarks = tuple(self.remarks)
         known = frozenset(self.variables.names)
         self.constant_variables = _checked_names("constant_variables", self.constant_variables, known)
         if isinstance(self.duplicated_variables, str) or not isinstance(self.duplicated_variables, Iterable):
@@ -337,6 +342,7 @@ class CausalGraph:
             raise ValueError(f"text is not JSON: {error}") from error
         if not isinstance(content, dict):
             raise ValueError(f"text is not a causal graph: it holds a {type(content).__name__}, not an object")
+        content.setdefault("remarks", ())  # files of earlier versions have none
         expected = {f.name for f in fields(cls)}
         if set(content) != expected:
             missing, unknown = sorted(expected - set(content)), sorted(set(content) - expected)

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from sb3_causalgdp.causal.figures import FONT_SIZE, ROW_INCHES, check_choice, label_inches
+from sb3_causalgdp.causal.figures import AS_TEXT, FONT_SIZE, ROW_INCHES, check_choice, label_inches
 from sb3_causalgdp.causal.graph import PLOTS_HINT, CausalGraph
 from sb3_causalgdp.causal.summary import Groups, Summary, summarize
 from sb3_causalgdp.causal.variables import TransitionVariables
@@ -107,12 +107,12 @@ def draw_matrix(shown: CausalGraph, axes: Axes, values: str, is_grouped: bool, l
 
 def name_causes(variables: TransitionVariables, axes: Axes, font_size: float = FONT_SIZE) -> None:
     causes = (*variables.state_names, *variables.action_names)
-    axes.set_xticks(range(len(causes)), causes, rotation=90, fontsize=font_size)
+    axes.set_xticks(range(len(causes)), causes, rotation=90, fontsize=font_size, **AS_TEXT)
 
 
 def name_effects(variables: TransitionVariables, axes: Axes, font_size: float = FONT_SIZE) -> None:
     effects = (*variables.next_state_names, "reward")
-    axes.set_yticks(range(len(effects)), effects, fontsize=font_size)
+    axes.set_yticks(range(len(effects)), effects, fontsize=font_size, **AS_TEXT)
 
 
 def _number_groups(image: AxesImage, axes: Axes) -> None:

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from sb3_causalgdp.causal.figures import FONT_SIZE, ROW_INCHES, label_inches
+from sb3_causalgdp.causal.figures import AS_TEXT, FONT_SIZE, ROW_INCHES, label_inches
 from sb3_causalgdp.causal.graph import PLOTS_HINT, CausalGraph, Edge
 from sb3_causalgdp.causal.heat_maps import largest_value
 from sb3_causalgdp.causal.summary import Groups, summarize
@@ -104,7 +104,7 @@ def _draw_names(variables: TransitionVariables, positions: dict[str, tuple[float
     for name, (x, y) in positions.items():
         corner = (x - width / 2, y - 0.36)
         axes.add_patch(Rectangle(corner, width, 0.72, facecolor=colours[name], edgecolor="0.5", linewidth=0.8, zorder=3))
-        axes.text(x, y, name, ha="center", va="center", fontsize=FONT_SIZE, zorder=4)
+        axes.text(x, y, name, ha="center", va="center", fontsize=FONT_SIZE, zorder=4, **AS_TEXT)
     for layer, header in enumerate(("state and action, t", "state, t+1", "reward, t")):
         axes.text(layer * (width + GAP_INCHES), 1.0, header, ha="center", va="center", fontsize=FONT_SIZE, color="0.35")
     axes.set_xlim(-width / 2 - 0.5, 2.5 * width + 2 * GAP_INCHES + 0.5)

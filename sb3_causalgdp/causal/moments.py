@@ -6,7 +6,8 @@ import numpy.typing as npt
 import torch as th
 
 LARGEST_VALUE = 1e140  # so that the sum of squares stays inside float64
-CONSTANT_FLOOR = 1e-10  # a million times float64's rounding, yet below a sensor at 1e6 with sd 1e-3
+CONSTANT_SHARE = 1e-10  # of the mean: a million times float64's rounding, yet below a sensor at 1e6 with sd 1e-3
+CONSTANT_FLOOR = 1e-12  # what rounding leaves of numbers around 1 that cancel, yet below rewards in units of 1e-9
 FIRST_BLOCK_ROWS = 8  # so that a jackknife has blocks to leave out from the first graph on
 MANY_ROWS = 128  # from where half of a product costs more time than another matrix of its size
 FORGOTTEN = 1e-9  # weight of a block, relative to that of the newest batch, that says nothing any more
@@ -34,8 +35,8 @@ class Spread:
 
     @property
     def constant(self) -> np.ndarray:
-        """Which columns do not move: standard deviation at most 1e-10 max(1, \\|mean\\|), boolean, shape (p,)."""
-        return self.standard_deviation() <= CONSTANT_FLOOR * np.maximum(1.0, np.abs(self.mean))
+        """Which columns do not move: standard deviation at most 1e-10 \\|mean\\| or 1e-12, boolean, shape (p,)."""
+        return self.standard_deviation() <= np.maximum(CONSTANT_FLOOR, CONSTANT_SHARE * np.abs(self.mean))
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,6 +174,24 @@ def _add_products(deviations: np.ndarray, comoment: np.ndarray, cross: np.ndarra
         cross += inputs.T @ targets
 
 
+def check_rows(rows: npt.ArrayLike, names: Sequence[str]) -> np.ndarray:
+    """
+    :param rows: Rows of p columns, shape (N, p)
+    :param names: The p names of the columns
+    :return: the rows in float64; no copy where they are already
+    :raises ValueError: on a wrong shape, or on NaN, infinite or absurdly large (1e140) values, naming the variables
+    """
+    rows = np.asarray(rows, dtype=np.float64)
+    if rows.ndim != 2 or rows.shape[1] != len(names):
+        raise ValueError(f"rows must have shape (N, {len(names)}), got {rows.shape}")
+    bad = ~(np.abs(rows) < LARGEST_VALUE)
+    if bad.any():
+        variables = [names[i] for i in np.flatnonzero(bad.any(axis=0))]
+        row = int(np.flatnonzero(bad.any(axis=1))[0])
+        raise ValueError(f"rows must be finite (below {LARGEST_VALUE:g}): first bad row {row}, bad variables {variables}")
+    return rows
+
+
 class StreamingMoments:
     """
     Weighted count, mean and co-moment of a stream of rows, in float64, kept as a ring of blocks of consecutive rows.
@@ -266,11 +285,7 @@ class StreamingMoments:
         :return: the rows in float64, shape (N, p); no copy where they are already
         :raises ValueError: where ``update`` would raise
         """
-        rows = np.asarray(rows, dtype=np.float64)
-        if rows.ndim != 2 or rows.shape[1] != self.n_variables:
-            raise ValueError(f"rows must have shape (N, {self.n_variables}), got {rows.shape}")
-        self._check_finite(rows)
-        return rows
+        return check_rows(rows, self.names)
 
     def _decay(self, n_new_rows: int) -> None:
         """Weigh old rows less; a block goes when its weight is nothing beside that of the new rows."""
@@ -292,13 +307,6 @@ class StreamingMoments:
             for i in range(self.n_blocks // 2):
                 self._blocks[i : i + 2] = [merge(self._blocks[i : i + 2], into_first=True)]
             self._block_rows *= 2
-
-    def _check_finite(self, rows: np.ndarray) -> None:
-        bad = ~(np.abs(rows) < LARGEST_VALUE)
-        if bad.any():
-            variables = [self.names[i] for i in np.flatnonzero(bad.any(axis=0))]
-            row = int(np.flatnonzero(bad.any(axis=1))[0])
-            raise ValueError(f"rows must be finite (below {LARGEST_VALUE:g}): first bad row {row}, bad variables {variables}")
 
     @property
     def blocks(self) -> tuple[Moments, ...]:
@@ -335,6 +343,16 @@ class StreamingMoments:
         return float(sum(block.count for block in self._blocks))
 
     @property
+    def fewest_rows(self) -> float:
+        """Sum of the rows' weights that is not fallen below once rows are forgotten; infinite where none are."""
+        # A new block begins with one row, when the oldest has gone
+        n_rows = np.inf if self.window is None else (self.n_blocks - 1) * self._block_rows + 1.0
+        if self.half_life is None:
+            return float(n_rows)
+        fading = 0.5 ** (1.0 / self.half_life)
+        return float((1.0 - fading**n_rows) / (1.0 - fading))
+
+    @property
     def mean(self) -> np.ndarray:
         """Shape (p,)."""
         return self.spread().mean
@@ -355,7 +373,7 @@ class StreamingMoments:
 
     @property
     def constant(self) -> np.ndarray:
-        """Which columns do not move: standard deviation at most 1e-10 max(1, \\|mean\\|), boolean, shape (p,)."""
+        """Which columns do not move: standard deviation at most 1e-10 \\|mean\\| or 1e-12, boolean, shape (p,)."""
         return self.spread().constant
 
     def correlation(self) -> np.ndarray:

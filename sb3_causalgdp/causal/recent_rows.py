@@ -47,6 +47,11 @@ class RecentRows:
         """Number of rows seen."""
         return self.moments.n_samples
 
+    @property
+    def fewest_rows(self) -> float:
+        """Number of rows that are kept once the ring is full."""
+        return float(self.window)
+
     def update(self, rows: npt.ArrayLike) -> None:
         """
         Add a batch of rows; nothing changes when it raises.

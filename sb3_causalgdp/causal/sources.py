@@ -164,7 +164,8 @@ class TransitionSource(ABC):
 
 class ReplayBufferSource(TransitionSource):
     """
-    A replay buffer of SB3, or of its shape: one-step transitions straight from its arrays, oldest first.
+    A replay buffer of SB3, or of its shape: one-step transitions straight from its arrays, oldest first. The preloaded
+    transitions that CausalGDP saved with it come before its own.
 
     SB3 stores actions scaled to [-1, 1] and observations as the environment gave them.
 
@@ -175,29 +176,21 @@ class ReplayBufferSource(TransitionSource):
     """
 
     def __init__(self, buffer: Any, name: str = "replay buffer", max_rows: int | None = None) -> None:
-        missing = [attribute for attribute in BUFFER_ATTRIBUTES if not hasattr(buffer, attribute)]
-        if missing:
-            kind = type(buffer).__name__
-            raise SourceError(f"{name} holds no replay buffer but a {kind}: save one with model.save_replay_buffer(path)")
-        self.buffer = buffer
+        _check_is_buffer(buffer, name)
+        preloaded, _ = getattr(buffer, "offline_part", (None, []))
+        buffers = [buffer] if preloaded is None or preloaded is buffer else [preloaded, buffer]
         self._flat = FlatSpace(buffer.observation_space)
         variables = TransitionVariables(self._flat.names, _action_names(buffer.action_space))
-        n_positions = buffer.buffer_size if buffer.full else buffer.pos
-        if buffer.full and buffer.optimize_memory_usage:
-            n_positions -= 1  # the oldest observation has been overwritten
-        self._positions = np.arange(buffer.pos - n_positions, buffer.pos) % buffer.buffer_size
-        n_stored = n_positions * buffer.n_envs
-        if buffer.optimize_memory_usage:
-            n_stored = int(np.count_nonzero(buffer.dones[self._positions] == 0.0))
-        super().__init__(name, variables, n_stored, max_rows)
+        self._held = [(one, _held_positions(one)) for one in buffers]
+        super().__init__(name, variables, sum(_n_known(one, positions) for one, positions in self._held), max_rows)
 
     def _parts(self, n_rows: int) -> Iterator[np.ndarray]:
-        positions_per_part = max(1, n_rows // self.buffer.n_envs)
-        for first in range(0, len(self._positions), positions_per_part):
-            yield self._read(self._positions[first : first + positions_per_part])
+        for buffer, positions in self._held:
+            positions_per_part = max(1, n_rows // buffer.n_envs)
+            for first in range(0, len(positions), positions_per_part):
+                yield self._read(buffer, positions[first : first + positions_per_part])
 
-    def _read(self, positions: np.ndarray) -> np.ndarray:
-        buffer = self.buffer
+    def _read(self, buffer: Any, positions: np.ndarray) -> np.ndarray:
         if buffer.optimize_memory_usage:
             after, next_positions = buffer.observations, (positions + 1) % buffer.buffer_size
         else:
@@ -217,6 +210,28 @@ class ReplayBufferSource(TransitionSource):
         if isinstance(observations, dict):
             return self._flat({key: _all_environments(values, positions) for key, values in observations.items()})
         return self._flat(_all_environments(observations, positions))
+
+
+def _check_is_buffer(buffer: Any, name: str) -> None:
+    missing = [attribute for attribute in BUFFER_ATTRIBUTES if not hasattr(buffer, attribute)]
+    if missing:
+        kind = type(buffer).__name__
+        raise SourceError(f"{name} holds no replay buffer but a {kind}: save one with model.save_replay_buffer(path)")
+
+
+def _held_positions(buffer: Any) -> np.ndarray:
+    """The positions that can be read, oldest first."""
+    n_positions = buffer.buffer_size if buffer.full else buffer.pos
+    if buffer.full and buffer.optimize_memory_usage:
+        n_positions -= 1  # the oldest observation has been overwritten
+    return np.arange(buffer.pos - n_positions, buffer.pos) % buffer.buffer_size
+
+
+def _n_known(buffer: Any, positions: np.ndarray) -> int:
+    """Number of transitions there whose next observation is kept."""
+    if buffer.optimize_memory_usage:
+        return int(np.count_nonzero(buffer.dones[positions] == 0.0))
+    return len(positions) * buffer.n_envs
 
 
 def _all_environments(values: np.ndarray, positions: np.ndarray) -> np.ndarray:

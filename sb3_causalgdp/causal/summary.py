@@ -55,6 +55,7 @@ class Summary:
             standard_errors=errors,
             num_timesteps=graph.num_timesteps,
             found_at=graph.found_at,
+            remarks=graph.remarks,
         )
 
     def _aggregated(self, matrix: np.ndarray) -> np.ndarray:

@@ -1,13 +1,17 @@
 """Gaussian models of the next state and of the reward, each output of which sees only what causes it."""
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch as th
 from torch import nn
 
 from sb3_causalgdp.activations import tanh_
 from sb3_causalgdp.products import linear
+
+
+SMALLEST_STD = 1e-12
+ROUNDINGS = 8.0 * th.finfo(th.float32).eps
 
 
 class MaskedBlocks(nn.Module):
@@ -126,6 +130,18 @@ def _mean(values: th.Tensor, known: th.Tensor | None) -> th.Tensor:
     return known @ values / known.sum().clamp(min=1.0)
 
 
+def moves(std: th.Tensor, mean: th.Tensor) -> th.Tensor:
+    """
+    Whether a variable moves by more than rounding. What does not is measured in units of 1: a quotient by rounding says
+    nothing and is of any size. What moves by less than 1e-12 counts as that: squares of its noise would leave float32.
+
+    :param std: Standard deviations in float32
+    :param mean: Means, of the same shape
+    :return: Boolean, of the same shape
+    """
+    return std > SMALLEST_STD + ROUNDINGS * mean.abs()
+
+
 def _drawn(mask: th.Tensor) -> th.Tensor:
     # Exact at 0 and 1: a uniform number is below 1 and not below 0
     return (th.rand_like(mask) < mask).to(mask.dtype)
@@ -210,6 +226,10 @@ class MaskedWorldModel(nn.Module):
     change_variance: th.Tensor
     reward_mean: th.Tensor
     reward_variance: th.Tensor
+    state_unit_square: th.Tensor
+    """Running variance of the states, 1 for those that do not move, shape ``(n,)``."""
+    reward_unit_square: th.Tensor
+    """Running variance of the rewards, 1 if they do not move, shape ``()``."""
 
     def __init__(self, state_dim: int, action_dim: int, net_arch: list[int] | None = None) -> None:
         super().__init__()
@@ -240,6 +260,9 @@ class MaskedWorldModel(nn.Module):
         }
         for name, value in buffers.items():
             self.register_buffer(name, value)
+        # They follow from the others: once for an update, not each time that they are needed
+        self.register_buffer("state_unit_square", th.ones(state_dim), persistent=False)
+        self.register_buffer("reward_unit_square", th.ones(()), persistent=False)
 
     def set_masks(
         self,
@@ -272,6 +295,18 @@ class MaskedWorldModel(nn.Module):
         for name, mask in masks.items():
             getattr(self, name).copy_(mask)
 
+    def _set_units(self) -> None:
+        for square, variance, mean in (
+            (self.state_unit_square, self.state_variance, self.state_mean),
+            (self.reward_unit_square, self.reward_variance, self.reward_mean),
+        ):
+            square.copy_(th.where(moves(variance.sqrt(), mean), variance, 1.0))
+
+    def _load_from_state_dict(self, *args: Any, **kwargs: Any) -> None:
+        super()._load_from_state_dict(*args, **kwargs)
+        with th.no_grad():
+            self._set_units()
+
     @th.no_grad()
     def update_statistics(
         self, state: th.Tensor, next_state: th.Tensor, reward: th.Tensor, known: th.Tensor | None = None
@@ -299,18 +334,19 @@ class MaskedWorldModel(nn.Module):
             spread = _mean((values - batch_mean).square(), known)
             variance.lerp_(spread + (1.0 - weight) * difference.square(), weight)
             mean.lerp_(batch_mean, weight)
+        self._set_units()
         # About 0, not about its mean: the residual path leaves the mean change to the network
         self.change_variance.lerp_(_mean((next_state - state).square(), known), weight)
 
     @property
     def state_std(self) -> th.Tensor:
-        """Running standard deviation of the states, shape ``(n,)``."""
-        return self.state_variance.sqrt().clamp(min=1e-4)
+        """Unit of the states: their running standard deviation, 1 for those that do not move, shape ``(n,)``."""
+        return self.state_unit_square.sqrt()
 
     @property
     def reward_scale(self) -> th.Tensor:
-        """Running standard deviation of the rewards, shape ``()``."""
-        return self.reward_variance.sqrt().clamp(min=1e-4)
+        """Unit of the rewards: their running standard deviation, 1 if they do not move, shape ``()``."""
+        return self.reward_unit_square.sqrt()
 
     @property
     def residual_std(self) -> th.Tensor:
@@ -342,12 +378,13 @@ class MaskedWorldModel(nn.Module):
         return self._next_state(state, action, self._transition_mask())
 
     def _next_state(self, state: th.Tensor, action: th.Tensor, mask: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        state_std = self.state_std
         standardised, inputs = self._network_input(state, action)
         residual_std = self.residual_std
         change = residual_std * self.transition(inputs, mask)
         mean = self.state_to_state.diagonal() * standardised + change
-        std = self._bounded(self.transition_log_std).exp() * residual_std * self.state_std
-        return self.state_mean + self.state_std * mean, std
+        std = self._bounded(self.transition_log_std).exp() * residual_std * state_std
+        return self.state_mean + state_std * mean, std
 
     def predict_reward(self, next_state: th.Tensor, action: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """
@@ -359,8 +396,8 @@ class MaskedWorldModel(nn.Module):
 
     def _reward(self, next_state: th.Tensor, action: th.Tensor, mask: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         _, inputs = self._network_input(next_state, action)
-        mean = self.reward(inputs, mask).squeeze(1)
-        return self.reward_mean + self.reward_scale * mean, self._bounded(self.reward_log_std).exp() * self.reward_scale
+        mean, scale = self.reward(inputs, mask).squeeze(1), self.reward_scale
+        return self.reward_mean + scale * mean, self._bounded(self.reward_log_std).exp() * scale
 
     def negative_log_likelihood(
         self,
@@ -401,8 +438,9 @@ class MaskedWorldModel(nn.Module):
         :param action: a in [-1, 1], shape ``(batch, d)``
         :return: See :class:`ActionResponse`
         """
+        state_std, reward_scale = self.state_std, self.reward_scale
         standardised, inputs = self._network_input(state, action)
-        residual_std, state_std = self.residual_std, self.state_std
+        residual_std = self.residual_std
         actions = slice(self.state_dim, None)
         noise_std = self._bounded(self.transition_log_std).exp()
         # In standard deviations from the start: Humanoid's Jacobians fill megabytes, and each pass over them takes time
@@ -412,7 +450,7 @@ class MaskedWorldModel(nn.Module):
         next_standardised = self.state_to_state.diagonal() * standardised + residual_std * change
         reward_inputs = th.cat([next_standardised.clamp(-self.INPUT_BOUND, self.INPUT_BOUND), action], dim=1)
         reward, reward_gradient = self.reward.forward_and_jacobian(
-            reward_inputs, self._reward_mask(), slice(None), self.reward_scale
+            reward_inputs, self._reward_mask(), slice(None), reward_scale
         )
         reward_gradient = reward_gradient.squeeze(1)
         by_next_state, by_action = reward_gradient[:, : self.state_dim], reward_gradient[:, self.state_dim :]
@@ -421,8 +459,8 @@ class MaskedWorldModel(nn.Module):
             next_state=self.state_mean + state_std * next_standardised,
             next_state_std=noise_std * residual_std * state_std,
             standardised_jacobian=jacobian,
-            reward=self.reward_mean + self.reward_scale * reward.squeeze(1),
-            reward_std=self._bounded(self.reward_log_std).exp() * self.reward_scale,
+            reward=self.reward_mean + reward_scale * reward.squeeze(1),
+            reward_std=self._bounded(self.reward_log_std).exp() * reward_scale,
             reward_by_next_state=by_next_state,
             reward_by_action=by_action,
         )

@@ -27,6 +27,7 @@ class TrainingCheckpointCallback(BaseCallback):
     :param folder: Of the checkpoints; a folder for each training
     :param every: Environment steps from one checkpoint to the next, in ``pretrain()`` gradient steps
     :param keep: How many of the newest checkpoints to keep, None for all; transitions are shared by all
+    :param at_end: Whether to write one at the end of the training, too, so that more steps can follow
     :param handle_sigterm: Whether to write a checkpoint on SIGTERM
     :param verbose: Verbosity level: 1 prints each checkpoint
     :raises ValueError: If ``every`` or ``keep`` is below 1, and when the training starts, if the folder is another training's
@@ -40,6 +41,7 @@ class TrainingCheckpointCallback(BaseCallback):
         folder: str | Path,
         every: int = 10_000,
         keep: int | None = 2,
+        at_end: bool = True,
         handle_sigterm: bool = True,
         verbose: int = 0,
     ) -> None:
@@ -50,6 +52,7 @@ class TrainingCheckpointCallback(BaseCallback):
         self.folder = Path(folder)
         self.every = every
         self.keep = keep
+        self.at_end = at_end
         self.handle_sigterm = handle_sigterm
         self._handler_before: Any = None
         self._was_asked_to_stop = False
@@ -96,7 +99,7 @@ class TrainingCheckpointCallback(BaseCallback):
         self._restore_handler()
         # A callback may have ended the training in the middle of a rollout
         is_complete = self.model.num_timesteps >= self.model._total_timesteps
-        if is_complete and self.model.num_timesteps != self._saved_at:
+        if self.at_end and is_complete and self.model.num_timesteps != self._saved_at:
             self._save()
 
     def _restore_handler(self) -> None:

@@ -14,6 +14,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 import torch as th
+from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import VectorizedActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
@@ -312,20 +313,31 @@ def begin_new_episodes(model: OffPolicyAlgorithm) -> None:
     """
     warnings.warn("The environments begin new episodes: a part of their state could not be saved.")
     model._last_obs = None
-    buffer, env = model.replay_buffer, model.env
-    assert env is not None
-    if buffer is not None and buffer.size() > 0:
-        if isinstance(buffer, HerReplayBuffer):
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")
-                buffer.truncate_last_trajectory()
-        else:
-            unfinished = buffer.dones[buffer.pos - 1] == 0
-            buffer.dones[buffer.pos - 1][unfinished] = 1
-            if buffer.handle_timeout_termination:
-                buffer.timeouts[buffer.pos - 1][unfinished] = 1
+    if model.replay_buffer is not None:
+        end_last_episodes(model.replay_buffer)
     if model.seed is not None:
-        env.seed(fresh_seed(model))
+        assert model.env is not None
+        model.env.seed(fresh_seed(model))
+
+
+def end_last_episodes(buffer: ReplayBuffer) -> None:
+    """
+    Mark the newest transitions as the last ones before a timeout, where environments are reset in the middle of an episode:
+    returns of several steps and hindsight goals must not reach over the gap.
+
+    :param buffer: A replay buffer
+    """
+    unfinished = buffer.dones[buffer.pos - 1] == 0
+    if buffer.size() == 0 or not unfinished.any():
+        return
+    if isinstance(buffer, HerReplayBuffer):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            buffer.truncate_last_trajectory()
+        return
+    buffer.dones[buffer.pos - 1][unfinished] = 1
+    if buffer.handle_timeout_termination:
+        buffer.timeouts[buffer.pos - 1][unfinished] = 1
 
 
 def fresh_seed(model: OffPolicyAlgorithm) -> int:

@@ -107,6 +107,17 @@ def open_checkpoint(path: Path) -> Iterator[Checkpoint]:
         yield _opened_zip(path, stack) if path.is_file() else _newest_whole(path)
 
 
+def is_checkpoint(path: Path) -> bool:
+    """
+    :param path: A file
+    :return: Whether it is a zip file with a checkpoint in it
+    """
+    if not zipfile.is_zipfile(path):
+        return False
+    with zipfile.ZipFile(path) as archive:
+        return MANIFEST in archive.namelist()
+
+
 class _NotWhole(ValueError):
     """What is wrong with a checkpoint."""
 

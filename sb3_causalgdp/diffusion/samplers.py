@@ -6,6 +6,7 @@ from functools import partial
 
 import torch as th
 
+from sb3_causalgdp.diffusion.bounds import bounded
 from sb3_causalgdp.diffusion.guidance import Guidance, GuidanceRule, NoisePredictor, guidance_shift
 from sb3_causalgdp.diffusion.schedules import NoiseSchedule
 
@@ -129,7 +130,8 @@ def sample(
     :param action_dim: Number of action components, where neither ``noise`` nor the denoiser tells
     :param sampler: ``ddpm`` or ``ddim``
     :param eta: Noise of DDIM: 0 is deterministic, 1 is DDPM
-    :param clip: Bound of the clean estimate, None for no bound
+    :param clip: Bound of the clean estimate, None for no bound; gradients that point back inside pass it, see
+        :func:`~sb3_causalgdp.diffusion.bounds.bounded`
     :param divergences: If a list, each guided step appends its ``||mu_cg - mu||^2 / (2 sigma_k^2)``, shape ``(batch,)``:
         their sum is KL(pi_cg || pi) of the chain (the paper's Theorem 1), with DDPM's sigma_k
     :return: Actions, shape ``(batch, d)``
@@ -155,15 +157,11 @@ def sample(
             shift = guidance_shift(guidance, rule, predict_noise, schedule, action, predicted, step, clip)
             guided = clean + (spread / signal) * shift
             if divergences is not None:
-                divergences.append(_step_divergence(schedule, step, _clip(clean, clip), _clip(guided, clip)))
+                divergences.append(_step_divergence(schedule, step, bounded(clean, clip), bounded(guided, clip)))
             clean = guided
         fresh = noise[min(position + 1, schedule.n_steps - 1)]
-        action = denoising_step(schedule, step, action, _clip(clean, clip), fresh, eta)
+        action = denoising_step(schedule, step, action, bounded(clean, clip), fresh, eta)
     return action
-
-
-def _clip(action: th.Tensor, clip: float | None) -> th.Tensor:
-    return action if clip is None else action.clamp(-clip, clip)
 
 
 def _step_divergence(schedule: NoiseSchedule, step: int, clean: th.Tensor, guided: th.Tensor) -> th.Tensor:

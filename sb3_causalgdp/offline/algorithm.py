@@ -12,17 +12,27 @@ from typing import Any, TypeVar
 import numpy as np
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback, ProgressBarCallback
-from stable_baselines3.common.noise import ActionNoise
+from stable_baselines3.common.noise import ActionNoise, VectorizedActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import MaybeCallback, Schedule
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.utils import FloatSchedule, configure_logger
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_normalize
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from sb3_causalgdp.archives import errors_of, existing
 from sb3_causalgdp.files import saved_when_done
+from sb3_causalgdp.offline.loaded_buffers import check_loaded_buffer, in_columns
 from sb3_causalgdp.offline.observations import flat_space
-from sb3_causalgdp.offline.preload import check_buffer, copy_rows, positions_needed, preload_buffer, spaces_of
+from sb3_causalgdp.offline.preload import (
+    check_buffer,
+    copy_rows,
+    normalised_parts,
+    positions_needed,
+    preload_buffer,
+    prime_normalizer,
+    spaces_of,
+)
 from sb3_causalgdp.offline.replay import SpacesEnv, can_sample
 from sb3_causalgdp.offline.rewards import RewardTransform, check_reward_transform
 from sb3_causalgdp.offline.saved_buffers import SUFFIXES, can_be_arrays, read_buffer, write_buffer
@@ -75,6 +85,10 @@ class OfflineToOnlineAlgorithm(OffPolicyAlgorithm):
         self._reward_transform: RewardTransform | None = None
         self._n_pretrain_steps = 0
         self._env_steps_before_pretrain: int | None = None
+        # Which parts of the observations were normalised when the networks were trained last, None before they were
+        self._trained_normalised: list[str] | None = None
+        # A buffer of hindsight replay that is known to hold a whole episode: to look for one takes as long as to sample
+        self._buffer_with_episode: ReplayBuffer | None = None
 
     @property
     def n_pretrain_steps(self) -> int:
@@ -89,6 +103,8 @@ class OfflineToOnlineAlgorithm(OffPolicyAlgorithm):
         if self._env_steps_before_pretrain is not None:
             # Saved by a callback in the middle of pretrain()
             self.num_timesteps, self._env_steps_before_pretrain = self._env_steps_before_pretrain, None
+        if self.env is not None:
+            self._check_normalisation(self._vec_normalize_env)
         super()._setup_model()
         if self.offline_dataset is not None:
             assert self.replay_buffer is not None
@@ -119,6 +135,37 @@ class OfflineToOnlineAlgorithm(OffPolicyAlgorithm):
         model = cls(policy, SpacesEnv(observation_space, action_space, n_envs), **kwargs)
         model.env = None
         return model
+
+    def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
+        """
+        Set the environment, see SB3's ``set_env``. A training ``VecNormalize`` counts the preloaded transitions.
+
+        :param env: The environment
+        :param force_reset: Whether it is reset before training goes on
+        :raises ValueError: If its ``VecNormalize`` would normalise the observations of a policy that was trained on others
+        """
+        normalizer = unwrap_vec_normalize(env) if isinstance(env, VecEnv) else None
+        self._check_normalisation(normalizer)
+        if normalizer is not None and self.offline_buffer is not None and self._reward_transform is not None:
+            check_buffer(self.offline_buffer, self._reward_transform, normalizer)
+        super().set_env(env, force_reset)
+        if normalizer is not None and self.offline_buffer is not None:
+            prime_normalizer(normalizer, self.offline_buffer, (0, self.offline_buffer.size()), self._offline_marks)
+
+    def _check_normalisation(self, normalizer: VecNormalize | None) -> None:
+        before, now = self._trained_normalised, normalised_parts(normalizer)
+        if before is None or before == now:
+            return
+        if not set(now) <= set(before):
+            argument = f"norm_obs_keys={before}" if before else "norm_obs=False"
+            raise ValueError(
+                f"The policy was trained on {_normalised(before)}, and this VecNormalize would give it {_normalised(now)}: "
+                f"pass {argument} to it, or give the model this environment before it is trained or pretrained"
+            )
+        warnings.warn(
+            f"The policy was trained on {_normalised(before)}, and this environment gives it {_normalised(now)}: wrap it with "
+            "VecNormalize.load(path, env) of the training's statistics"
+        )
 
     def preload(
         self: SelfAlgorithm,
@@ -307,6 +354,10 @@ class OfflineToOnlineAlgorithm(OffPolicyAlgorithm):
             self.pretrain(steps, both, progress_bar=progress_bar)
         if self.offline_buffer is not None and self.offline_buffer is self.replay_buffer:
             self.replay_buffer = self._new_buffer(self.buffer_size)
+        noise = self.action_noise
+        if isinstance(noise, VectorizedActionNoise) and noise.n_envs != self.env.num_envs:
+            # Of a model that was saved with another number of environments
+            self.action_noise = VectorizedActionNoise(noise.base_noise, self.env.num_envs)
         return super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
 
     def _sample_action(
@@ -314,6 +365,18 @@ class OfflineToOnlineAlgorithm(OffPolicyAlgorithm):
     ) -> tuple[np.ndarray, np.ndarray]:
         # A pretrained policy collects the transitions that learning starts with: it knows better than to act at random
         return super()._sample_action(0 if self._n_pretrain_steps > 0 else learning_starts, action_noise, n_envs)
+
+    def _waits_for_episode(self) -> bool:
+        """Whether nothing can be sampled before an episode ends, as in hindsight replay that was loaded without a buffer."""
+        buffer = self.replay_buffer
+        known = buffer is self._buffer_with_episode or self.offline_buffer is not None
+        if known or not isinstance(buffer, HerReplayBuffer):
+            return False
+        if can_sample(buffer):
+            self._buffer_with_episode = buffer
+            return False
+        warnings.warn("Updates wait: HerReplayBuffer holds no whole episode yet. They begin when the first one has ended.")
+        return True
 
     def _n_offline(self, batch_size: int) -> int:
         if self.offline_buffer is None:
@@ -352,6 +415,7 @@ class OfflineToOnlineAlgorithm(OffPolicyAlgorithm):
             pickled = True
             warnings.warn(f"{type(self.replay_buffer).__name__} is pickled: load_replay_buffer needs trusted=True to read it")
         self.replay_buffer.offline_part = (self.offline_buffer, self._offline_marks)  # type: ignore[attr-defined]
+        self.replay_buffer.saved_after = self.n_environment_steps  # type: ignore[attr-defined]
         try:
             with saved_when_done(path, ".pkl" if pickled else ".npz") as file:
                 if pickled:
@@ -360,32 +424,59 @@ class OfflineToOnlineAlgorithm(OffPolicyAlgorithm):
                     write_buffer(self.replay_buffer, file)
         finally:
             del self.replay_buffer.offline_part  # type: ignore[attr-defined]
+            del self.replay_buffer.saved_after  # type: ignore[attr-defined]
 
     def load_replay_buffer(
         self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True, *, trusted: bool = False
     ) -> None:
         """
         Load a replay buffer, and the preloaded transitions that were saved with it. When it raises, the model has what it had.
+        Transitions of another number of environments are put into as many columns as the model has environments.
 
         :param path: Path to the file, as ``.npz`` or pickled; without its suffix, the first of these that is there
         :param truncate_last_traj: See SB3's ``load_replay_buffer``, for ``HerReplayBuffer``
         :param trusted: Whether a pickle may hold more than the replay buffers of SB3, which could run code
-        :raises ValueError: If the file is not whole, or not trusted and needs to be
+        :raises ValueError: If the file is not whole, or not trusted and needs to be; if the buffer is of another environment,
+            is damaged, holds NaN or infinite values, or is of another number of environments and cannot be brought to the model's
         """
-        buffer = read_buffer(existing(path, SUFFIXES) if isinstance(path, str | os.PathLike) else path, trusted)
+        is_path = isinstance(path, str | os.PathLike)
+        buffer = read_buffer(existing(path, SUFFIXES) if is_path else path, trusted)
+        self._use_loaded_buffer(buffer, str(path) if is_path else "The replay buffer", truncate_last_traj)
+
+    def _use_loaded_buffer(self, buffer: ReplayBuffer, name: str, truncate_last_traj: bool) -> None:
+        """All or nothing."""
         offline, marks = vars(buffer).pop("offline_part", (None, []))
+        saved_after = vars(buffer).pop("saved_after", self.num_timesteps)
         for one in {id(one): one for one in (buffer, offline) if one is not None}.values():
             if isinstance(one, HerReplayBuffer):
                 assert self.env is not None, "You must pass an environment at load time when using `HerReplayBuffer`"
                 one.set_env(self.env)
             # Update saved replay buffer device to match current setting, see GH#1561
             one.device = self.device
-        if isinstance(buffer, HerReplayBuffer) and truncate_last_traj:
-            buffer.truncate_last_trajectory()
-        self.replay_buffer, self.offline_buffer, self._offline_marks = buffer, offline, marks
+        online = self._fitting(buffer, name)
+        if offline is buffer:
+            offline = online
+        elif offline is not None:
+            offline = self._fitting(offline, f"{name}, preloaded part")
+        if isinstance(online, HerReplayBuffer) and truncate_last_traj:
+            online.truncate_last_trajectory()
+        self.replay_buffer, self.offline_buffer, self._offline_marks = online, offline, marks
+        if saved_after != self.num_timesteps:
+            warnings.warn(
+                f"{name} was saved after {saved_after} steps, the model after {self.num_timesteps}: they are not of one "
+                "moment, as they are in a checkpoint of save_checkpoint()"
+            )
+
+    def _fitting(self, buffer: ReplayBuffer, name: str) -> ReplayBuffer:
+        check_loaded_buffer(buffer, self.observation_space, self.action_space, name)
+        return buffer if buffer.n_envs == self.n_envs else in_columns(buffer, self.n_envs, self._new_buffer, name)
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "offline_buffer", "_offline_marks"]
+        return [*super()._excluded_save_params(), "offline_buffer", "_offline_marks", "_buffer_with_episode"]
+
+
+def _normalised(parts: list[str]) -> str:
+    return f"observations with {parts} normalised" if parts else "raw observations"
 
 
 class _GradientStepsBar(ProgressBarCallback):

@@ -6,7 +6,7 @@ import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 
@@ -252,7 +252,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser = make_parser()
     arguments = parser.parse_args(argv)
     # Without this, a terminated process would leave the unfinished dataset's folder
-    before = signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
+    before = signal.signal(signal.SIGTERM, _terminate)
     try:
         run(arguments)
     except (ValueError, OSError, ImportError) as error:
@@ -262,6 +262,11 @@ def main(argv: Sequence[str] | None = None) -> None:
         sys.exit(130)
     finally:
         signal.signal(signal.SIGTERM, before)
+
+
+def _terminate(*_: Any) -> NoReturn:
+    print("terminated: no dataset was written", file=sys.stderr)
+    sys.exit(143)
 
 
 def run(arguments: argparse.Namespace) -> None:

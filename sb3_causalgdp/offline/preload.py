@@ -104,14 +104,13 @@ def preload_buffer(
     transform = make_reward_transform(reward_transform, returns) if isinstance(reward_transform, str) else reward_transform
     first, end = writer.first, writer.first + writer.n_positions
     raw_rewards = buffer.rewards[first:end].astype(np.float64)
-    if normalizer is not None and normalizer.training:
-        _prime_returns(normalizer, raw_rewards, buffer.dones[first:end])
-        _prime_observations(normalizer, buffer, first, end)
+    mark = f"{source.name}: {source.n_transitions} transitions, rewards {raw_rewards.sum()}"
+    if normalizer is not None:
+        prime_normalizer(normalizer, buffer, (first, end), [mark])
     buffer.rewards[first:end] = transform(raw_rewards)
     _advance(buffer, end)
     if isinstance(buffer, HerReplayBuffer):
         _mark_episodes(buffer, first, end)
-    mark = f"{source.name}: {source.n_transitions} transitions, rewards {raw_rewards.sum()}"
     return Preloaded(first, end, transform, mark)
 
 
@@ -344,6 +343,35 @@ def _check_environment(source: Source, env: VecEnv | None) -> None:
         return
     if spec is not None and spec.name != source.environment:
         warnings.warn(f"{source.name} was collected in {source.environment}, and the model's environment is {spec.name}")
+
+
+def prime_normalizer(normalizer: VecNormalize, buffer: ReplayBuffer, rows: tuple[int, int], marks: list[str]) -> None:
+    """
+    Count rows in the statistics of a ``VecNormalize`` that is training, unless it has counted them before: it remembers that,
+    also when it is saved and loaded.
+
+    :param normalizer: The ``VecNormalize``
+    :param buffer: The buffer, whose rewards are as recorded
+    :param rows: Position of the first row, and that after the last one
+    :param marks: Which transitions these are, see :class:`Preloaded`
+    """
+    counted: list[str] = vars(normalizer).setdefault("preloaded_marks", [])
+    if not normalizer.training or set(marks) <= set(counted):
+        return
+    first, end = rows
+    _prime_returns(normalizer, buffer.rewards[first:end].astype(np.float64), buffer.dones[first:end])
+    _prime_observations(normalizer, buffer, first, end)
+    counted += marks
+
+
+def normalised_parts(normalizer: VecNormalize | None) -> list[str]:
+    """
+    :param normalizer: A model's ``VecNormalize``
+    :return: What of its observations is normalised: keys of a dictionary, else ``["observation"]``; empty if nothing is
+    """
+    if normalizer is None or not normalizer.norm_obs:
+        return []
+    return sorted(normalizer.norm_obs_keys) if normalizer.norm_obs_keys is not None else ["observation"]
 
 
 def _prime_observations(normalizer: VecNormalize, buffer: ReplayBuffer, first: int, end: int) -> None:

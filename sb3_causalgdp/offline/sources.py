@@ -44,6 +44,33 @@ class Chunk:
         return len(self.rewards)
 
 
+def as_flags(values: Any, name: str) -> np.ndarray:
+    """
+    :param values: Whether something is so, for each of N transitions: bool, or 0 and 1, shape ``(N,)`` or ``(N, 1)``
+    :param name: What to call them
+    :return: The same as bool, shape ``(N,)``
+    :raises ValueError: If one is anything else, such as NaN, -1 or a string
+    """
+    values = np.asarray(values)
+    flags = _one_each(values, name)
+    if values.dtype == bool:
+        return flags
+    known = np.zeros(len(flags), dtype=bool)
+    if values.dtype.kind in "fiuO":
+        known = ((flags == 0) | (flags == 1)).astype(bool)
+    if not known.all():
+        row = int(np.argmin(known))
+        raise ValueError(f"{name} must be bool, or 0 and 1, got {flags.tolist()[row]!r} at transition {row}")
+    return (flags == 1).astype(bool)
+
+
+def _one_each(values: np.ndarray, name: str) -> np.ndarray:
+    """Shape (N,)."""
+    if values.shape[1:] not in ((), (1,)):
+        raise ValueError(f"{name} must have the shape (N,) or (N, 1), got {values.shape}")
+    return values.reshape(-1)
+
+
 class Source:
     """
     Offline transitions: a name, the spaces where they are known, and the rows in their order.
@@ -102,13 +129,14 @@ class MinariSource(Source):
         episodes = self._episodes()
         for number, episode in enumerate(episodes):
             # T steps have T + 1 observations; float64 and nested like the space
-            truncations = np.array(episode.truncations, dtype=bool)
+            truncations = as_flags(episode.truncations, f"{self.name}: truncations of episode {number}").copy()
+            terminations = as_flags(episode.terminations, f"{self.name}: terminations of episode {number}")
             if len(truncations) == 0:
                 continue
-            if not (episode.terminations[-1] or truncations[-1]):
+            if not (terminations[-1:].any() or truncations[-1]):
                 truncations[-1] = True  # the recording stopped there
             lengths = {len(values) - 1 for values in _arrays_of(episode.observations)}
-            lengths |= {len(values) for values in (episode.actions, episode.rewards)}
+            lengths |= {len(values) for values in (episode.actions, episode.rewards, terminations)}
             if lengths != {len(truncations)}:
                 raise ValueError(
                     f"{self.name}: episode {number} is incomplete, its arrays have lengths that do not fit together"
@@ -118,7 +146,7 @@ class MinariSource(Source):
                 _rows_of(episode.observations, slice(1, None)),
                 np.asarray(episode.actions),
                 np.asarray(episode.rewards),
-                np.asarray(episode.terminations, dtype=bool),
+                terminations,
                 truncations,
             )
 
@@ -134,7 +162,8 @@ class MinariSource(Source):
 
 class BufferSource(Source):
     """
-    A replay buffer of SB3: the trajectory of each environment, one after the other.
+    A replay buffer of SB3: the trajectory of each environment, one after the other. The preloaded transitions that were saved
+    with it come first.
 
     :param buffer: The buffer
     :param name: What to call it
@@ -143,32 +172,46 @@ class BufferSource(Source):
     has_scaled_actions = True
 
     def __init__(self, buffer: ReplayBuffer, name: str = "The replay buffer") -> None:
-        if buffer.optimize_memory_usage:
+        self.buffers = [part for part in (preloaded_part_of(buffer), buffer) if part is not None]
+        if any(part.optimize_memory_usage for part in self.buffers):
             raise ValueError(
                 f"{name} was made with optimize_memory_usage=True and does not hold the last observations of its episodes: "
                 "continue it with load_replay_buffer(), or record it without that option"
             )
-        super().__init__(name, buffer.size() * buffer.n_envs, buffer.observation_space, buffer.action_space)
-        self.buffer = buffer
+        n_transitions = sum(part.size() * part.n_envs for part in self.buffers)
+        super().__init__(name, n_transitions, buffer.observation_space, buffer.action_space)
 
     def chunks(self) -> Iterator[Chunk]:
-        buffer = self.buffer
+        for buffer in self.buffers:
+            for column in range(buffer.n_envs):
+                yield from self._trajectory(buffer, column)
+
+    def _trajectory(self, buffer: ReplayBuffer, column: int) -> Iterator[Chunk]:
         positions = np.arange(buffer.pos - buffer.size(), buffer.pos) % buffer.buffer_size
-        for column in range(buffer.n_envs):
-            for first in range(0, len(positions), CHUNK_ROWS):
-                rows = positions[first : first + CHUNK_ROWS]
-                dones, truncations = buffer.dones[rows, column] > 0.0, buffer.timeouts[rows, column] > 0.0
-                terminations = dones & ~truncations
-                if rows[-1] == positions[-1] and not dones[-1]:
-                    truncations[-1] = True  # the next one belongs to another environment
-                yield Chunk(
-                    _rows_of(buffer.observations, (rows, column)),
-                    _rows_of(buffer.next_observations, (rows, column)),
-                    buffer.actions[rows, column],
-                    buffer.rewards[rows, column],
-                    terminations,
-                    truncations,
-                )
+        for first in range(0, len(positions), CHUNK_ROWS):
+            rows = positions[first : first + CHUNK_ROWS]
+            dones = as_flags(buffer.dones[rows, column], f"{self.name}: dones of environment {column}")
+            truncations = as_flags(buffer.timeouts[rows, column], f"{self.name}: timeouts of environment {column}")
+            terminations = dones & ~truncations
+            if rows[-1] == positions[-1] and not dones[-1]:
+                truncations[-1] = True  # the next one belongs to another environment
+            yield Chunk(
+                _rows_of(buffer.observations, (rows, column)),
+                _rows_of(buffer.next_observations, (rows, column)),
+                buffer.actions[rows, column],
+                buffer.rewards[rows, column],
+                terminations,
+                truncations,
+            )
+
+
+def preloaded_part_of(buffer: ReplayBuffer) -> ReplayBuffer | None:
+    """
+    :param buffer: A replay buffer that was saved
+    :return: The buffer of preloaded transitions that was saved with it; None if there is none, or it is the same
+    """
+    part, _ = getattr(buffer, "offline_part", (None, []))
+    return None if part is buffer else part
 
 
 class ArraySource(Source):
@@ -192,6 +235,11 @@ class ArraySource(Source):
             raise ValueError(f"{name} must have one row for each transition, got lengths {lengths}")
         if not np.issubdtype(self.arrays["actions"].dtype, np.floating):
             raise ValueError(f"{name} have actions of {self.arrays['actions'].dtype}, but continuous actions are needed")
+        for key in ("terminations", "truncations"):
+            self.arrays[key] = as_flags(self.arrays[key], f"{name}: {key}")
+        self.arrays["rewards"] = _one_each(self.arrays["rewards"], f"{name}: rewards")
+        for key in ("observations", "next_observations", "rewards"):
+            _check_numbers(self.arrays[key], f"{name}: {key}")
         super().__init__(name, len(self.arrays["actions"]))
 
     def chunks(self) -> Iterator[Chunk]:
@@ -204,10 +252,16 @@ class ArraySource(Source):
                 observations,
                 next_observations,
                 actions,
-                rewards.reshape(-1),
-                terminations.reshape(-1).astype(bool),
-                truncations.reshape(-1).astype(bool),
+                rewards,
+                terminations,
+                truncations,
             )
+
+
+def _check_numbers(tree: Any, name: str) -> None:
+    for values in _arrays_of(tree):
+        if values.dtype.kind not in "fiub":
+            raise ValueError(f"{name} must be numbers, got an array of {values.dtype}")
 
 
 def open_source(source: Any, download: bool = True, trusted: bool = False) -> Source:

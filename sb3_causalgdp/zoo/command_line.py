@@ -12,6 +12,7 @@ from typing import NoReturn
 
 import gymnasium as gym
 
+from sb3_causalgdp import TrainingDivergedError
 from sb3_causalgdp.offline.registration import register_environments
 from sb3_causalgdp.zoo.registration import ZOO_HINT, SetupError, register
 from sb3_causalgdp.zoo.scripts import surroundings
@@ -101,7 +102,7 @@ def _run(script: str, arguments: Sequence[str]) -> None:
 
 def _is_about_usage(error: Exception) -> bool:
     """Whether the message says it all: what RL Zoo itself complains about, what is not installed, what is not on the hub."""
-    if isinstance(error, SetupError | ImportError | gym.error.Error):
+    if isinstance(error, SetupError | TrainingDivergedError | ImportError | gym.error.Error):
         return True
     frames = _frames(error)
     if any(name in Path(frame.filename).parts for frame in frames for name in HUB_PACKAGES):

@@ -2,6 +2,7 @@
 
 import os
 import shlex
+import shutil
 import sys
 import time
 import traceback
@@ -9,7 +10,7 @@ import warnings
 from collections import OrderedDict
 from collections.abc import Callable
 from contextlib import suppress
-from functools import partial
+from functools import partial, partialmethod
 from pathlib import Path
 from pprint import pprint
 from typing import Any
@@ -19,20 +20,24 @@ import torch as th
 import yaml
 from rl_zoo3 import exp_manager
 from rl_zoo3.exp_manager import ExperimentManager
+from rl_zoo3.utils import get_latest_run_id
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback, EvalCallback
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_causalgdp import CausalGDP
+from sb3_causalgdp import CausalGDP, TrainingCheckpointCallback
+from sb3_causalgdp.checkpoints.store import is_checkpoint
+from sb3_causalgdp.files import replaced_when_done
 from sb3_causalgdp.offline.callbacks import NormalizedEvalCallback
 from sb3_causalgdp.offline.scores import find_reference
+from sb3_causalgdp.zoo.going_on import FOLDER as CHECKPOINTS
+from sb3_causalgdp.zoo.going_on import RunLock, cut_monitors, interrupted_run, new_folder, write_command
 from sb3_causalgdp.zoo.hyperparameters import SCHEDULES, hyperparameter_file, make_schedule, merged, read_entry
 from sb3_causalgdp.zoo.offline_tasks import OFFLINE_TASKS
 from sb3_causalgdp.zoo.registration import ALGORITHM, SetupError
+from sb3_causalgdp.zoo.scripts import replaced
 from sb3_causalgdp.zoo.search_space import sample_causalgdp_params
 from sb3_causalgdp.zoo.versions import installed_versions
-
-DIVERGENCE_CALLBACK = "sb3_causalgdp.zoo.callbacks.StopOnDivergence"
 
 
 class CausalGDPExperimentManager(ExperimentManager):
@@ -48,8 +53,27 @@ class CausalGDPExperimentManager(ExperimentManager):
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
-        if self.algo == ALGORITHM and kwargs.get("config") is None:
+        self._uuid = kwargs.get("uuid_str", "")
+        self._made_folder = False
+        self._lock: RunLock | None = None
+        self._manifest: dict[str, Any] | None = None
+        if self.algo != ALGORITHM:
+            return
+        if kwargs.get("config") is None:
             self.config = str(hyperparameter_file())
+        if not (self.continue_training or self.optimize_hyperparameters):
+            self._look_for_interrupted_run()
+
+    def _look_for_interrupted_run(self) -> None:
+        found = interrupted_run(Path(self.log_path), self.env_name)
+        if found is None:
+            return
+        folder, self._lock, self._manifest = found
+        self.save_path, self.params_path = str(folder), str(folder / self.env_name)
+        self.trained_agent, self.continue_training = str(folder / CHECKPOINTS), True
+        # Episodes are added to those that are there
+        self.monitor_kwargs["override_existing"] = False
+        print(f"Going on with {folder}")
 
     def setup_experiment(self) -> tuple[BaseAlgorithm, dict[str, Any]] | None:
         task = OFFLINE_TASKS.get(self.env_name.gym_id)
@@ -59,16 +83,26 @@ class CausalGDPExperimentManager(ExperimentManager):
         try:
             return super().setup_experiment()
         except Exception as error:
-            self._remove_empty_folders()
+            if self._made_folder:
+                # An empty run would be the latest one, which the other scripts look for
+                shutil.rmtree(self.save_path, ignore_errors=True)
             raise SetupError(f"{self.algo} on {self.env_name.gym_id}: {_message(error)}") from error
 
-    def _remove_empty_folders(self) -> None:
-        """An empty run would be the latest one, which the other scripts look for."""
-        for folder in (self.params_path, self.save_path):
-            try:
-                os.rmdir(folder)
-            except OSError:
-                return
+    def create_log_folder(self) -> None:
+        if self._manifest is not None:
+            cut_monitors(Path(self.save_path), self._manifest["num_timesteps"] // self.n_envs)
+            return
+        self.save_path = new_folder(self.save_path, self._numbered)
+        self._made_folder = True
+        self.params_path = f"{self.save_path}/{self.env_name}"
+        os.mkdir(self.params_path)
+        if self.algo == ALGORITHM and not self.optimize_hyperparameters:
+            self._lock = RunLock(Path(self.save_path))
+            write_command(Path(self.save_path))
+
+    def _numbered(self) -> str:
+        number = get_latest_run_id(self.log_path, self.env_name) + 1
+        return os.path.join(self.log_path, f"{self.env_name}_{number}{self._uuid}")
 
     # Hyperparameters ----------------------------------------------------------------------------------------------------
 
@@ -102,21 +136,23 @@ class CausalGDPExperimentManager(ExperimentManager):
         # RL Zoo makes schedules of the learning rate alone, which cannot be loaded without it
         schedules = {key: make_schedule(key, hyperparams.pop(key)) for key in SCHEDULES if key in hyperparams}
         rest, env_wrapper, callbacks, vec_env_wrapper = super()._preprocess_hyperparams(hyperparams)
-        given = self.specified_callbacks or []
-        self.specified_callbacks = [*(given if isinstance(given, list) else [given]), DIVERGENCE_CALLBACK]
         return {**rest, **schedules}, env_wrapper, callbacks, vec_env_wrapper
 
     # Files ----------------------------------------------------------------------------------------------------------------
 
     def _save_config(self, saved_hyperparams: dict[str, Any]) -> None:
+        if self._manifest is not None:
+            return
         super()._save_config(saved_hyperparams)
-        folder = Path(self.params_path)
-        # RL Zoo's command lacks the shell's quotes
-        (folder / "command.txt").write_text(shlex.join(sys.orig_argv), encoding="utf-8")
         versions = yaml.safe_dump(installed_versions(), sort_keys=False, allow_unicode=True)
-        (folder / "versions.yml").write_text(versions, encoding="utf-8")
+        # RL Zoo's command lacks the shell's quotes
+        for name, text in {"command.txt": shlex.join(sys.orig_argv), "versions.yml": versions}.items():
+            with replaced_when_done(Path(self.params_path, name)) as file:
+                file.write_text(text, encoding="utf-8")
 
     def _load_pretrained_agent(self, hyperparams: dict[str, Any], env: VecEnv) -> BaseAlgorithm:
+        if self.algo == ALGORITHM and (self._manifest is not None or is_checkpoint(Path(self.trained_agent))):
+            return CausalGDP.resume(self.trained_agent, env, self.device)
         model = super()._load_pretrained_agent(hyperparams, env)
         if isinstance(model, CausalGDP):
             # The steps of the new run begin at 0, and so does the history that it saves
@@ -137,7 +173,24 @@ class CausalGDPExperimentManager(ExperimentManager):
             with suppress(EOFError):  # Ctrl-C has ended the environments' processes, too
                 model.env.close()
             return
-        super().learn(model)
+        if self._manifest is None:
+            super().learn(model)
+            return
+        self.n_timesteps = max(0, self.n_timesteps - model.num_timesteps)
+        with replaced(CausalGDP, "learn", partialmethod(CausalGDP.learn, reset_num_timesteps=False)):
+            super().learn(model)
+
+    def create_callbacks(self) -> None:
+        every = self.save_freq
+        super().create_callbacks()
+        if self.algo == ALGORITHM:
+            self.callbacks.append(self._checkpoints(every))
+
+    def _checkpoints(self, every: int) -> TrainingCheckpointCallback:
+        """Without --save-freq, one is written when the process is asked to end."""
+        return TrainingCheckpointCallback(
+            Path(self.save_path, CHECKPOINTS), every if every > 0 else sys.maxsize, at_end=False, verbose=self.verbose
+        )
 
     def _pretrain(self, model: CausalGDP) -> bool:
         """The offline stage, with evaluations and checkpoints; False if it was interrupted, and the model is to be saved."""
@@ -153,7 +206,7 @@ class CausalGDPExperimentManager(ExperimentManager):
     def _offline_callbacks(self, model: CausalGDP) -> list[BaseCallback]:
         """As in the training, but numbered by gradient steps, in a folder of their own."""
         folder = os.path.join(self.save_path, "offline")
-        callbacks: list[BaseCallback] = []
+        callbacks: list[BaseCallback] = [self._checkpoints(self.save_freq * self.n_envs)]
         if self.save_freq > 0:
             callbacks.append(CheckpointCallback(self.save_freq * self.n_envs, folder, name_prefix="rl_model", verbose=1))
         for online in self.callbacks:

@@ -244,6 +244,7 @@ def _graph_section(model: CausalGDP) -> Section:
         remarks.append(f"Never moved, and have no edges: {', '.join(graph.constant_variables)}.")
     for group in graph.duplicated_variables:
         remarks.append(f"Are linear functions of each other, and share their masks: {', '.join(group)}.")
+    remarks += [f"{remark}." for remark in graph.remarks]
     pictures = [
         _picture(plot_causal_graph(graph, kind="heat_map"), "Masks, with the signs of the effects: a column causes a row."),
         _picture(plot_causal_graph(graph, kind="graph"), "The same as a graph: from now, on the left, to the next state."),

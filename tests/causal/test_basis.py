@@ -227,11 +227,22 @@ def test_the_memory_limit_takes_blocks_away_and_then_is_an_error():
     # Products of 15 features with each other, twice, and with 2 and 1 targets: 3960 bytes a block
     assert [BasisMoments(VARIABLES, max_memory=size).dynamics.n_blocks for size in (8 * 3960, 7 * 3960, 2 * 3960)] == [8, 6, 2]
     with pytest.raises(ValueError, match=r"15 features of 3 states and actions .* use basis='additive', or"):
-        BasisMoments(VARIABLES, max_memory=2 * 3960 - 1)
+        BasisMoments(VARIABLES, basis="products", max_memory=2 * 3960 - 1)
     with pytest.raises(ValueError, match="use basis='linear', or give it more memory"):
         BasisMoments(VARIABLES, basis="additive", max_memory=1000)
     with pytest.raises(ValueError, match="MB: give it more memory"):
         BasisMoments(VARIABLES, basis="linear", max_memory=100)
+
+
+def test_the_default_features_become_simpler_where_memory_is_short_and_say_so():
+    for memory, basis in ((2 * 3960, "products"), (2 * 3960 - 1, "additive"), (2 * 8 * 12 * 27 - 1, "linear")):
+        statistics = BasisMoments(VARIABLES, max_memory=memory)
+        assert statistics.basis == basis
+        assert (f"found with basis={basis!r}" in statistics.remark) == (basis != "products")
+    many = TransitionVariables(tuple(f"s{i}" for i in range(771)), ("a",))
+    statistics = BasisMoments(many)
+    assert statistics.basis == "linear"
+    assert statistics.remark.startswith("3088 features of 772 states and actions need 343 MB, and max_memory is 200 MB")
 
 
 def test_memory_is_that_of_the_blocks():

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch as th
 from matplotlib.figure import Figure
+from matplotlib.text import Text
 
 from sb3_causalgdp.causal import MaskedWorldModel, StructuralModel, TransitionVariables
 from sb3_causalgdp.causal.effect_plots import plot_action_effects, plot_next_state_effects, plot_reward_effects
@@ -324,6 +325,15 @@ def test_the_heat_map_leaves_out_what_has_no_path(linear):
     axes = plot_next_state_effects(linear.effect_of_actions(*draw(50)))
     np.testing.assert_array_equal(axes.images[0].get_array().mask, B == 0.0)
     assert "no path" in axes.get_xlabel()
+
+
+def test_a_dollar_sign_in_a_name_is_a_dollar_sign(tmp_path):
+    variables = TransitionVariables(("a_$x_$b", "y", "$/m^2 and $/m_"), ("cash $$", "v"))
+    effects = StructuralModel(linear_world_model(), variables).effect_of_actions(*draw(50))
+    figure = plot_action_effects(effects, tmp_path / "effects.png")
+    shown = [text for text in figure.findobj(Text) if "$" in text.get_text()]
+    assert {"cash $$", "a_$x_$b'"} <= {text.get_text() for text in shown}
+    assert not any(text.get_parse_math() for text in shown)
 
 
 def test_missing_matplotlib_says_what_to_install(monkeypatch, linear):

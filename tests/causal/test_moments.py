@@ -219,6 +219,15 @@ def test_clear_forgets_all_rows():
     assert moments.n_samples == 300
 
 
+@pytest.mark.parametrize("unit", [1e-9, 1.0, 1e9])
+def test_a_small_unit_is_no_constant(unit):
+    rows = np.random.default_rng(0).normal(size=(100, 2))
+    moments = StreamingMoments(2)
+    moments.update(rows * [unit, 1.0])
+    assert moments.constant.tolist() == [False, False]
+    np.testing.assert_allclose(moments.correlation(), np.corrcoef(rows.T), atol=1e-6)
+
+
 def test_constant_columns_have_zero_correlation():
     rows = np.random.default_rng(0).normal(size=(100, 4))
     rows[:, 1] = 0.1

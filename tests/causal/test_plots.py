@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 from matplotlib.patches import FancyArrowPatch
+from matplotlib.text import Text
 from PIL import Image
 
 from sb3_causalgdp.causal import CausalGraph, TransitionVariables
@@ -63,6 +64,17 @@ def test_plot_writes_an_image_without_a_warning(tmp_path, kind, size):
 def test_every_name_is_on_the_plot(draw):
     graph = make_graph()
     assert set(graph.variables.names) <= set(texts(draw(graph)))
+
+
+@pytest.mark.parametrize("name", ["cash $$", "price_$ vs cost_$", "$/m^2 and $/m_", "a_$x_$b", "$x$", r"\$"])
+@pytest.mark.parametrize("kind", ["heat_map", "graph"])
+def test_a_dollar_sign_in_a_name_is_a_dollar_sign(tmp_path, name, kind):
+    graph = CausalGraph.fully_connected(TransitionVariables((name, "other"), (f"u {name}",)))
+    figure = graph.plot(tmp_path / "graph.png", kind=kind)
+    shown = [text for text in figure.findobj(Text) if "$" in text.get_text()]
+    assert {name, f"{name}'", f"u {name}"} <= {text.get_text() for text in shown}
+    assert not any(text.get_parse_math() for text in shown)
+    plot_history([graph, graph], tmp_path / "history.png")
 
 
 def test_axes_say_cause_and_effect():

@@ -309,6 +309,34 @@ def test_statistics_follow_a_change_of_the_data():
     assert abs(float(model.state_mean) - 10.0) < 1.0
 
 
+@pytest.mark.parametrize("unit", [1e-9, 1e-6, 1.0, 1e6])
+def test_units_change_predictions_by_the_unit_alone(unit):
+    """Of the rewards; of the states, too."""
+    predictions = []
+    for scale in (1.0, unit):
+        th.manual_seed(0)
+        model = MaskedWorldModel(2, 1, [16])
+        state, action = scale * th.randn(64, 2), th.rand(64, 1)
+        model.update_statistics(state, state + 0.1 * scale * action, scale * (state / scale).sum(dim=1))
+        (mean, std), (reward, reward_std) = model.predict_next_state(state, action), model.predict_reward(state, action)
+        response = model.action_response(state, action)
+        predictions.append(
+            [value / scale for value in (mean, std, reward, reward_std, model.state_std, model.reward_scale)]
+            + [response.reward_jacobian / scale, response.next_state_jacobian / scale, response.reward_by_next_state]
+        )
+    for value, expected in zip(*reversed(predictions), strict=True):
+        th.testing.assert_close(value, expected, rtol=1e-3, atol=1e-6)
+
+
+@pytest.mark.parametrize("value", [0.0, 1e-9, 0.1, 1e3, 5e6])
+def test_what_does_not_move_is_measured_in_ones(value):
+    model = MaskedWorldModel(2, 1, [16])
+    state = th.stack([th.randn(300), th.full((300,), value)], dim=1)
+    for rows in state.split(30):
+        model.update_statistics(rows, rows, th.full((30,), value))
+    assert model.state_std[1] == model.reward_scale == 1.0 and model.state_std[0] != 1.0
+
+
 def test_constant_variables_give_finite_predictions():
     model = MaskedWorldModel(2, 1, [8])
     state, reward = th.tensor([[1.0, 5.0]]).repeat(16, 1), th.zeros(16)

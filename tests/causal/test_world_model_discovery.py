@@ -42,6 +42,17 @@ def test_effects_are_in_standard_deviations_of_the_effect_per_one_of_the_cause(g
     assert graph.effects[2, 0] == pytest.approx(-1.0, rel=0.1)
 
 
+@pytest.mark.parametrize("offset", [1e3, 5e6])
+def test_far_from_zero_it_finds_the_same(offset, graph):
+    rows = nonlinear_system()
+    rows[:, VARIABLES.state] += offset
+    rows[:, VARIABLES.next_state] += offset
+    rows[:, VARIABLES.reward] += offset
+    moved = discover("world_model", rows, VARIABLES, **SMALL)
+    np.testing.assert_allclose(moved.masks, graph.masks, atol=0.02)
+    np.testing.assert_allclose(moved.effects, graph.effects, atol=0.02)
+
+
 def test_is_seeded_and_leaves_torchs_generator_alone():
     rows = nonlinear_system(200)
     state = th.get_rng_state()

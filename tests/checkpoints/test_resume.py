@@ -167,6 +167,32 @@ def test_a_loaded_model_does_not_live_through_its_first_steps_again(tmp_path):
     assert len({tuple(start) for start in starts}) == 3
 
 
+def test_returns_of_several_steps_do_not_reach_over_a_gap(tmp_path):
+    """With a buffer that was loaded, and with learn() that resets the environment in the middle of an episode."""
+    setup = Setup(arguments={"n_steps": 3})
+    model = setup.make_model().learn(104)
+    model.save(tmp_path / "model")
+    model.save_replay_buffer(tmp_path / "buffer.pkl")
+    loaded = CausalGDP.load(tmp_path / "model", env=setup.make_env(0))
+    loaded.load_replay_buffer(tmp_path / "buffer.pkl")
+    for one, reset in ((loaded, False), (model, True)):
+        one.learn(24, reset_num_timesteps=reset)
+        buffer = one.replay_buffer
+        assert buffer.dones[103, 0] == buffer.timeouts[103, 0] == 1
+        batch = buffer._get_samples(np.array([101]))
+        np.testing.assert_allclose(batch.next_observations[0], buffer.next_observations[103, 0])
+        assert batch.dones[0] == 0
+
+
+def test_a_model_and_a_buffer_of_other_steps_are_not_of_one_moment(tmp_path):
+    model = Setup().make_model().learn(64)
+    model.save(tmp_path / "model")
+    model.learn(40, reset_num_timesteps=False).save_replay_buffer(tmp_path / "buffer.pkl")
+    loaded = CausalGDP.load(tmp_path / "model")
+    with pytest.warns(UserWarning, match="saved after 104 steps, the model after 64"):
+        loaded.load_replay_buffer(tmp_path / "buffer.pkl")
+
+
 # What is wrong ------------------------------------------------------------------------------------------------------------
 
 
@@ -199,7 +225,7 @@ def test_what_cannot_be_resumed_is_said_in_one_line(folder, tmp_path):
     with pytest.raises(ValueError, match="is of CausalGDP, not of"):
         resume(type("Other", (CausalGDP,), {}), folder, Setup().make_env(0))
     (tmp_path / "text.zip").write_text("text")
-    with pytest.raises(ValueError, match="text.zip is no checkpoint"):
+    with pytest.raises(ValueError, match=r"text\.zip is no checkpoint"):
         CausalGDP.resume(tmp_path / "text.zip")
 
 

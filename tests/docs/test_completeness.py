@@ -8,6 +8,7 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 import pytest
+import torch as th
 from gymnasium import spaces
 from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.envs import BitFlippingEnv, FakeImageEnv
@@ -146,6 +147,42 @@ class UnboundedEnv(NanEnv):
     action_space = spaces.Box(-np.inf, np.inf, (1,))
 
 
+class HugeRewardEnv(NanEnv):
+    observation_space = spaces.Box(-1.0, 1.0, (2,))
+
+    def __init__(self, reward=1e39):
+        self.reward = reward
+
+    def step(self, action):
+        return np.zeros(2, dtype=np.float32), self.reward, False, False, {}
+
+
+class FixedEnv(NanEnv):
+    action_space = spaces.Box(1.0, 1.0, (1,))
+
+
+class DoubleRewards(DummyVecEnv):
+    """Does not round rewards, as processes do not."""
+
+    def __init__(self, env_fns):
+        super().__init__(env_fns)
+        self.buf_rews = self.buf_rews.astype(np.float64)
+
+
+def diverge():
+    make(HugeRewardEnv(1e30)).learn(32)
+
+
+def load_nan():
+    model = make()
+    model.set_parameters({"policy": {**model.policy.state_dict(), "return_std": th.tensor(np.nan)}}, exact_match=False)
+
+
+def load_a_state_of_another_size():
+    other = CausalGDP("MlpPolicy", "Pendulum-v1", **KWARGS, policy_kwargs={"net_arch": [8]}).learn(32)
+    make().set_parameters({"critic.optimizer": other.critic.optimizer.state_dict()}, exact_match=False)
+
+
 def make(env="Pendulum-v1", policy="MlpPolicy", **kwargs):
     return CausalGDP(policy, env, **{**SMALL, **kwargs})
 
@@ -178,8 +215,18 @@ ERRORS = {
     "You must use `MultiInputPolicy` when working with dict observation space": lambda: make(BitFlippingEnv(continuous=True)),
     "unexpected keyword argument 'use_sde'": lambda: make(use_sde=True),
     "The environment returned a NaN or infinite observation at step": lambda: make(NanEnv()).learn(10),
-    "Unknown guidance mode 'plain': it must be one of": lambda: make(guidance="plain"),
-    "unknown discovery method": lambda: make(causal_discovery="nothing"),
+    "The environment returned a reward that is infinite in float32 at step": lambda: make(
+        DoubleRewards([HugeRewardEnv])
+    ).learn(10),
+    "The observation is nan at row 2, index [1]: it must be finite in float32": lambda: make().predict(
+        np.where(np.arange(12).reshape(4, 3) == 7, np.nan, 0.0)
+    ),
+    "The training diverged: critic_loss is inf at update 1.": diverge,
+    "Nothing was loaded: policy.return_std holds nan": load_nan,
+    "critic.optimizer.state.0.exp_avg has the shape": load_a_state_of_another_size,
+    "action_space: component 0 from 1 to 1 is fixed: leave it out, or": lambda: make(FixedEnv()),
+    "gamma must be a number from 0 to 1, got 1.5": lambda: make(gamma=1.5),
+    "guidance must be one of ['normalized', 'posterior', 'score'] or None, got 'plain'": lambda: make(guidance="plain"),
     "VecNormalize scales the rewards already: pass norm_reward=False to it": preload_twice_scaled,
     "HerReplayBuffer computes rewards anew: reward_transform must be 'none' with it": preload_with_hindsight,
     "There is nothing to train on: call preload(source) or load_replay_buffer(path) first": lambda: make().pretrain(1),

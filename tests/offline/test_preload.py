@@ -458,6 +458,38 @@ def test_missing_arrays_and_lengths_are_named(episodes):
     refuses(make(), {**arrays, "rewards": np.zeros(3)}, "one row for each transition")
 
 
+@pytest.mark.parametrize("key", ["terminations", "truncations"])
+@pytest.mark.parametrize("value", [np.nan, -1, 2, 0.5, "False", None])
+def test_ends_of_episodes_are_bool_or_0_and_1(key, value, episodes):
+    arrays = arrays_of(episodes)
+    values = np.array([value if row == 3 else 0 for row in range(sum(LENGTHS))])
+    got = "'0'" if isinstance(value, str) else repr(value)
+    row = 0 if isinstance(value, str) else 3
+    refuses(make(), {**arrays, key: values}, f"{key} must be bool, or 0 and 1, got {got} at transition {row}")
+
+
+@pytest.mark.parametrize("dtype", [bool, int, np.uint8, np.float32, object])
+def test_ends_of_episodes_may_have_any_type_and_a_column(dtype, episodes):
+    arrays = arrays_of(episodes)
+    given = {key: arrays[key].astype(dtype)[:, None] for key in ("terminations", "truncations")}
+    buffer, expected = (make().preload({**arrays, **part}).replay_buffer for part in (given, {}))
+    np.testing.assert_array_equal(buffer.dones, expected.dones)
+    np.testing.assert_array_equal(buffer.timeouts, expected.timeouts)
+
+
+def test_ends_of_episodes_in_a_replay_buffer_are_0_and_1(episodes):
+    recorded = make().preload(arrays_of(episodes)).replay_buffer
+    recorded.dones[3, 0] = np.nan
+    refuses(make(), recorded, "The replay buffer: dones of environment 0 must be bool, or 0 and 1, got nan at transition 3")
+
+
+def test_rewards_are_one_number_each(episodes):
+    arrays = arrays_of(episodes)
+    refuses(make(), {**arrays, "rewards": np.zeros((sum(LENGTHS), 2))}, r"rewards must have the shape \(N,\) or \(N, 1\)")
+    refuses(make(), {**arrays, "rewards": arrays["rewards"].astype(str)}, "rewards must be numbers, got an array of <U")
+    refuses(make(), {**arrays, "observations": arrays["observations"] * 1j}, "observations must be numbers, got .* complex64")
+
+
 def test_shuffled_transitions_are_refused_where_order_matters(episodes):
     shuffled = {key: values[::-1] for key, values in arrays_of(episodes).items()}
     refuses(make(n_steps=3), shuffled, "not in the order of their episodes .* NStepReplayBuffer")

@@ -11,12 +11,12 @@ import torch as th
 import yaml
 from stable_baselines3.common.callbacks import BaseCallback
 
-from sb3_causalgdp import CausalGDP
+from sb3_causalgdp import CausalGDP, TrainingDivergedError
 
 pytest.importorskip("rl_zoo3")
 optuna = pytest.importorskip("optuna")
 
-from sb3_causalgdp.zoo.callbacks import StopOnDivergence  # noqa: E402
+import sb3_causalgdp.zoo.manager  # noqa: E402
 from sb3_causalgdp.zoo.search_space import convert_causalgdp_params, sample_causalgdp_params  # noqa: E402
 
 PENDULUM = ("--algo", "causalgdp", "--env", "Pendulum-v1", "-f", "logs", "--num-threads", "1", "--device", "cpu")
@@ -175,17 +175,15 @@ def test_divergence_stops_with_a_value_error():
         device="cpu",
         policy_kwargs={"net_arch": [8], "world_model_net_arch": [8]},
     )
-    with pytest.raises(ValueError, match=r"the training diverged: train/\w+_loss is nan after 2\d steps"):
-        model.learn(100, callback=[BreakTheActor(20), StopOnDivergence()])
+    with pytest.raises(TrainingDivergedError, match=r"training diverged: \w+_loss is nan at update 1\d"):
+        model.learn(100, callback=BreakTheActor(20))
     assert np.isfinite(model.replay_buffer.observations).all()
 
 
 @pytest.mark.parametrize("with_error", [False, True])
 def test_a_trial_that_diverges_is_pruned_and_the_search_goes_on(with_error, zoo, folder, capsys, monkeypatch):
-    import sb3_causalgdp.zoo.callbacks
-
-    monkeypatch.setattr(sb3_causalgdp.zoo.callbacks, "BreakTheActor", BreakTheActor, raising=False)
-    callback = {"sb3_causalgdp.zoo.callbacks.BreakTheActor": {"at_step": 20, "with_error": with_error}}
+    monkeypatch.setattr(sb3_causalgdp.zoo.manager, "BreakTheActor", BreakTheActor, raising=False)
+    callback = {"sb3_causalgdp.zoo.manager.BreakTheActor": {"at_step": 20, "with_error": with_error}}
     search = ("--optimize", "--n-trials", "2", "--n-evaluations", "1", "-n", "30", "--no-optim-plots", "--seed", "0")
     tiny = ("learning_starts:5", "buffer_size:100", "env_kwargs:dict(max_episode_steps=10)", f"callback:{callback}")
     with pytest.raises(SystemExit):

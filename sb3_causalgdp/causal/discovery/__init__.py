@@ -1,6 +1,7 @@
 """Causal discovery by name: each method says what it gathers from a stream of transitions and turns that into a graph."""
 
 import inspect
+import math
 from collections.abc import Callable
 from typing import Any, Protocol
 
@@ -94,10 +95,20 @@ def make_statistics(
     :param half_life: Number of new rows after which an old row weighs half; None weighs all alike
     :param window: Number of newest rows that are kept; None keeps all
     :return: statistics without any rows
+    :raises ValueError: when rows are forgotten before there are as many as the method needs
     """
+    statistics: Any
     if hasattr(method, "make_statistics"):
-        return method.make_statistics(variables, half_life, window)
-    return StreamingMoments(variables.n_variables, half_life, variables.names, window)
+        statistics = method.make_statistics(variables, half_life, window)
+    else:
+        statistics = StreamingMoments(variables.n_variables, half_life, variables.names, window)
+    kept, needed = getattr(statistics, "fewest_rows", math.inf), min_rows(method, variables)
+    if kept < needed:
+        raise ValueError(
+            f"window={window!r} and half_life={half_life!r} keep as few as {kept:.0f} rows, and discovery needs {needed} for "
+            f"{variables.n_states} states and {variables.n_actions} actions: keep more"
+        )
+    return statistics
 
 
 def min_rows(method: DiscoveryMethod, variables: TransitionVariables) -> int:

@@ -5,9 +5,10 @@ import numpy as np
 import torch as th
 from scipy.linalg import cho_solve
 
-from sb3_causalgdp.causal.basis import BASES, BasisExpansion, BasisMoments
+from sb3_causalgdp.causal.basis import BASES, BasisExpansion, BasisMoments, bytes_needed
 from sb3_causalgdp.causal.degenerate import Degeneracy, LimitsFinder
 from sb3_causalgdp.causal.graph import CausalGraph
+from sb3_causalgdp.causal.grouped import GroupedStatistics
 from sb3_causalgdp.causal.jackknife import jackknife_error
 from sb3_causalgdp.causal.matrices import cholesky_in_place, inverse_in_place, symmetric_product
 from sb3_causalgdp.causal.moments import Moments, Spread, StreamingMoments, leave_one_out
@@ -68,8 +69,11 @@ class PartialR2:
     :param spread: Uncertainty of the mask in ln(partial R^2), beside that of the sample, positive
     :param basis: The features: ``"linear"``, each variable as itself alone; ``"additive"``, with square, sine and tanh;
         ``"products"``, with the products of pairs, too; ``"auto"``: these where states and actions are at most 60, else
-        ``"additive"``
-    :param max_memory: Bytes that the moments may take
+        ``"additive"``; where ``max_memory`` is too small for these, the next simpler features, and for ``"linear"`` ones of
+        all variables, those of groups of neighbours. The graph's ``remarks`` say so
+    :param max_memory: Bytes that the moments of the features may take, positive. Beside them there are those of the variables
+        themselves, ``8 (2 n + d + 1)^2`` bytes, eight times as much with a window, and while a graph is found about twice what
+        the features take
     :param on_degenerate: ``"share"`` lets linearly dependent causes share a mask and gives constant ones none, ``"raise"`` is
         an error that names both
     """
@@ -88,6 +92,8 @@ class PartialR2:
             raise ValueError(f"spread must be a positive number, got {spread!r}")
         if basis not in BASES:
             raise ValueError(f"basis must be one of {BASES}, got {basis!r}")
+        if not 0.0 < max_memory < np.inf:
+            raise ValueError(f"max_memory must be a positive number of bytes, got {max_memory!r}")
         self.threshold = threshold
         self.spread = spread
         self.basis = basis
@@ -96,13 +102,17 @@ class PartialR2:
 
     def make_statistics(
         self, variables: TransitionVariables, half_life: float | None = None, window: int | None = None
-    ) -> BasisMoments:
+    ) -> BasisMoments | GroupedStatistics:
         """
         :param variables: Names and order of the variables
         :param half_life: Number of new rows after which an old row weighs half; None weighs all alike
         :param window: Number of newest rows that are kept; None keeps all
         :return: what this method gathers
+        :raises ValueError: when ``max_memory`` is too small for the features that ``basis`` names
         """
+        n_states, n_inputs = variables.n_states, variables.n_states + variables.n_actions
+        if self.basis == "auto" and bytes_needed(n_states, n_inputs, "linear") > self.max_memory:
+            return GroupedStatistics(variables, half_life, window, self.max_memory)
         return BasisMoments(variables, half_life, window, self.basis, self.max_memory)
 
     def min_rows(self, variables: TransitionVariables) -> int:
@@ -113,7 +123,10 @@ class PartialR2:
         return 2 * (variables.n_states + variables.n_actions) + 4
 
     def __call__(
-        self, statistics: BasisMoments, variables: TransitionVariables, previous: CausalGraph | None = None
+        self,
+        statistics: BasisMoments | GroupedStatistics,
+        variables: TransitionVariables,
+        previous: CausalGraph | None = None,
     ) -> CausalGraph:
         """
         Find the graph.
@@ -125,7 +138,10 @@ class PartialR2:
         :raises ValueError: on fewer than 2 (n + d) + 4 rows that are not forgotten, when the arguments are not about the same
             variables, or on linearly dependent or constant causes if ``on_degenerate="raise"``
         """
-        self._check(statistics, variables)
+        if isinstance(statistics, GroupedStatistics) and statistics.variables == variables:
+            statistics.start()
+            return statistics.spread_out(self(statistics.statistics, statistics.group_variables))
+        statistics = self._checked(statistics, variables)
         limits = self._find_limits(statistics.raw.correlation(), variables)
         rows = [
             self._estimate(_dynamics(statistics, limits.of_dynamics)),
@@ -140,6 +156,7 @@ class PartialR2:
             r_squared=r_squared,
             method="partial_r2",
             n_samples=statistics.dynamics.n_samples,
+            remarks=(statistics.remark,) if statistics.remark else (),
             **limits.remarks(),
         )
 
@@ -158,7 +175,7 @@ class PartialR2:
     def _log(self, estimates: "_Estimates") -> np.ndarray:
         return th.from_numpy(estimates.partial_r2).clamp(min=FLOOR_SHARE * self.threshold).log().numpy()
 
-    def _check(self, statistics: BasisMoments, variables: TransitionVariables) -> None:
+    def _checked(self, statistics: BasisMoments | GroupedStatistics, variables: TransitionVariables) -> BasisMoments:
         if not isinstance(statistics, BasisMoments) or statistics.variables != variables:
             raise ValueError(f"statistics must be those that make_statistics makes for {variables.names}, got {statistics!r}")
         statistics.start()
@@ -169,6 +186,7 @@ class PartialR2:
             raise ValueError(
                 f"partial_r2 needs at least {needed} rows (2 (states + actions) + 4) that are not forgotten, got {n_rows:.0f}"
             )
+        return statistics
 
 
 class _Estimates(NamedTuple):

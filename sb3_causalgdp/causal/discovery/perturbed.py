@@ -136,6 +136,16 @@ class NoisyStatistics:
         return self.statistics.n_samples
 
     @property
+    def count(self) -> float:
+        """Sum of the weights of the rows from which a graph is found."""
+        return getattr(self.statistics, "count", self.statistics.n_samples)
+
+    @property
+    def fewest_rows(self) -> float:
+        """Sum of the rows' weights that is not fallen below once rows are forgotten."""
+        return getattr(self.statistics, "fewest_rows", np.inf)
+
+    @property
     def wants_history(self) -> bool:
         """Whether the wrapped statistics want older rows again."""
         return getattr(self.statistics, "wants_history", False)

@@ -99,7 +99,8 @@ class WorldModelEffects:
         self.seed = seed
         self._find_limits = LimitsFinder(on_degenerate)
         self.world_model: MaskedWorldModel | None = None
-        """The method's own model, with all masks 1; None before the first graph."""
+        """The method's own model, all masks 1, of states and rewards less their means at the first graph; None before it."""
+        self._origin = np.zeros(0)
         self._refreshes = 0
 
     def make_statistics(
@@ -134,6 +135,11 @@ class WorldModelEffects:
             dependent or constant causes if ``on_degenerate="raise"``
         """
         rows = checked_rows(statistics, variables, "world_model", self.min_rows(variables))
+        if self.world_model is None or (self.world_model.state_dim, self.world_model.action_dim) != _sizes(variables):
+            self.world_model = None
+            self._origin = _origin_of(rows, variables)
+        # In float64: float32 would lose a small motion far from 0
+        rows = rows - self._origin
         generator = th.Generator().manual_seed(self.seed + self._refreshes)
         order = th.randperm(len(rows), generator=generator)
         values = th.as_tensor(rows[order.numpy()], dtype=th.float32)
@@ -194,7 +200,7 @@ class WorldModelEffects:
     def _train(self, rows: th.Tensor, variables: TransitionVariables, generator: th.Generator) -> None:
         n_steps = self.gradient_steps
         n_states, n_actions = variables.n_states, variables.n_actions
-        if self.world_model is None or (self.world_model.state_dim, self.world_model.action_dim) != (n_states, n_actions):
+        if self.world_model is None:
             n_steps = self.first_gradient_steps
             with th.random.fork_rng(devices=[]):
                 th.manual_seed(self.seed)
@@ -211,6 +217,18 @@ class WorldModelEffects:
             loss.backward()
             optimizer.step()
             schedule.step()
+
+
+def _sizes(variables: TransitionVariables) -> tuple[int, int]:
+    return variables.n_states, variables.n_actions
+
+
+def _origin_of(rows: np.ndarray, variables: TransitionVariables) -> np.ndarray:
+    """The means of the rewards and of the states, which s and s' share, shape ``(2 n + d + 1,)``."""
+    origin = np.zeros(variables.n_variables)
+    origin[variables.state] = origin[variables.next_state] = rows[:, variables.state].mean(axis=0)
+    origin[variables.reward] = rows[:, variables.reward].mean()
+    return origin
 
 
 def _columns(rows: th.Tensor, variables: TransitionVariables) -> tuple[th.Tensor, th.Tensor, th.Tensor, th.Tensor]:

@@ -1,0 +1,431 @@
+"""What the arguments of the algorithm and of its policy accept: one table each."""
+
+import difflib
+import inspect
+import os
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.noise import ActionNoise
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
+from stable_baselines3.common.vec_env import VecEnv
+from torch import nn
+
+from sb3_causalgdp.causal.discovery import DISCOVERY_METHODS
+from sb3_causalgdp.diffusion.guidance import GUIDANCE_COVARIANCES, GUIDANCE_MODES
+from sb3_causalgdp.diffusion.samplers import SAMPLERS
+from sb3_causalgdp.diffusion.schedules import NOISE_SCHEDULES
+from sb3_causalgdp.offline.rewards import REWARD_TRANSFORMS
+
+ACTOR_UPDATES = ("one_step", "chain")
+Q_SCALES = ("advantage", "value")
+GUIDANCE_TARGETS = ("return", "reward")
+
+# Rates and weights: their squares, and those of what they scale, stay inside float32
+LARGEST_WEIGHT = 1e6
+LARGEST_NUMBER = 1e30
+# What is a slip, or an attack by a file, rather than a wish
+MOST_STEPS = 1_000_000_000
+MOST_GRADIENT_STEPS = 1_000_000
+MOST_PRETRAIN_STEPS = 100_000_000
+MOST_DIFFUSION_STEPS = 1_000
+MOST_CANDIDATES = 10_000
+MOST_THREADS = 1_024
+WIDEST_LAYER = 65_536
+MOST_LAYERS = 100
+MOST_CRITICS = 100
+LARGEST_NOISE = 10.0
+ACTION_PRECISION = 1e-3  # of an action's half range
+
+
+class NotAcceptedError(ValueError):
+    """A value is not of a kind."""
+
+
+@dataclass(frozen=True)
+class Kind:
+    """
+    What an argument accepts.
+
+    :param accepted: In words, to stand behind "must be"
+    :param read: Gives what is to be stored, or raises :class:`NotAcceptedError`
+    """
+
+    accepted: str
+    read: Callable[[Any], Any]
+
+    def __or__(self, other: "Kind") -> "Kind":
+        def read(value: Any) -> Any:
+            try:
+                return self.read(value)
+            except NotAcceptedError:
+                return other.read(value)
+
+        return Kind(f"{self.accepted} or {other.accepted}", read)
+
+
+def _accepts(accepted: str, condition: Callable[[Any], bool], convert: Callable[[Any], Any] = lambda value: value) -> Kind:
+    def read(value: Any) -> Any:
+        if not condition(value):
+            raise NotAcceptedError
+        return convert(value)
+
+    return Kind(accepted, read)
+
+
+def _text(number: float) -> str:
+    return f"{number:,}" if isinstance(number, int) else f"{number:g}"
+
+
+def integer(low: int, high: int) -> Kind:
+    """
+    :param low: The smallest
+    :param high: The largest
+    :return: Integers, also numpy's, which become Python's
+    """
+
+    def condition(value: Any) -> bool:
+        return isinstance(value, (int, np.integer)) and not isinstance(value, bool) and bool(low <= value <= high)
+
+    return _accepts(f"an integer from {_text(low)} to {_text(high)}", condition, int)
+
+
+def number(low: float, high: float, above: bool = False) -> Kind:
+    """
+    :param low: The smallest
+    :param high: The largest
+    :param above: Whether it has to be larger than ``low``
+    :return: Numbers, also numpy's, which become Python's
+    """
+
+    def condition(value: Any) -> bool:
+        if not isinstance(value, (int, float, np.integer, np.floating)) or isinstance(value, bool):
+            return False
+        return bool((low < value if above else low <= value) and value <= high)
+
+    return _accepts(
+        f"a number above {_text(low)} and at most {_text(high)}" if above else f"a number from {_text(low)} to {_text(high)}",
+        condition,
+        lambda value: value if type(value) is int else float(value),
+    )
+
+
+NONE = _accepts("None", lambda value: value is None)
+FLAG = _accepts("True or False", lambda value: isinstance(value, (bool, np.bool_)), bool)
+TEXT = _accepts("a string", lambda value: isinstance(value, str))
+PATH = _accepts("a path", lambda value: isinstance(value, (str, os.PathLike)) and str(value) != "")
+KEYWORDS = _accepts(
+    "a dictionary with strings as keys",
+    lambda value: isinstance(value, Mapping) and all(isinstance(key, str) for key in value),
+    dict,
+)
+FUNCTION = _accepts("a function", callable)
+
+
+def choice(names: Iterable[str]) -> Kind:
+    """
+    :param names: Known names
+    :return: One of these
+    """
+    known = sorted(names)
+    accepted = repr(known[0]) if len(known) == 1 else f"one of {known}"
+    return _accepts(accepted, lambda value: isinstance(value, str) and value in known)
+
+
+def subclass(of: type, words: str) -> Kind:
+    """
+    :param of: A class
+    :param words: What its subclasses are called
+    :return: The class or a subclass
+    """
+    return _accepts(words, lambda value: isinstance(value, type) and issubclass(value, of))
+
+
+def instance(of: type | tuple[type, ...], words: str) -> Kind:
+    """
+    :param of: A class, or several
+    :param words: What its instances are called
+    :return: Instances of it
+    """
+    return _accepts(words, lambda value: isinstance(value, of))
+
+
+def schedule(kind: Kind) -> Kind:
+    """
+    :param kind: What the values have to be
+    :return: A number, or a function of the progress that remains, of which the first value is looked at
+    """
+
+    def read(value: Any) -> Any:
+        if not callable(value):
+            return kind.read(value)
+        try:
+            first = value(1.0)
+            kind.read(first.item() if isinstance(first, (np.ndarray, th.Tensor)) else first)
+        except (TypeError, ValueError, AttributeError) as error:
+            raise NotAcceptedError from error
+        return value
+
+    return Kind(f"{kind.accepted}, or a function that gives such numbers for the progress remaining (from 1 to 0)", read)
+
+
+def sequence(kind: Kind, words: str, shortest: int = 0, longest: int = MOST_LAYERS, equal: bool = False) -> Kind:
+    """
+    :param kind: What each element has to be
+    :param words: What the sequence is called
+    :param shortest: The smallest length
+    :param longest: The largest length
+    :param equal: Whether all elements have to be the same
+    :return: Lists, also tuples and arrays, which become lists
+    """
+
+    def read(value: Any) -> Any:
+        if not isinstance(value, (list, tuple, np.ndarray)) or not shortest <= len(value) <= longest:
+            raise NotAcceptedError
+        elements = [kind.read(element) for element in value]
+        if equal and len(set(elements)) > 1:
+            raise NotAcceptedError
+        return elements
+
+    return Kind(words, read)
+
+
+def _read_train_freq(value: Any) -> Any:
+    if isinstance(value, TrainFreq):
+        frequency, unit = value.frequency, value.unit
+    elif isinstance(value, (tuple, list)) and len(value) == 2:
+        frequency, unit = value
+    else:
+        return STEPS.read(value)
+    try:
+        name = TrainFrequencyUnit(unit).value
+    except ValueError as error:
+        raise NotAcceptedError from error
+    steps = STEPS.read(frequency)
+    return value if isinstance(value, TrainFreq) else (steps, name)
+
+
+def counts_episodes(train_freq: Any) -> bool:
+    """
+    :param train_freq: A frequency that is accepted
+    :return: Whether its unit is the episode
+    """
+    unit = train_freq[1] if isinstance(train_freq, tuple) else "step"
+    return TrainFrequencyUnit(unit) is TrainFrequencyUnit.EPISODE
+
+
+def _read_device(value: Any) -> Any:
+    if not isinstance(value, (str, th.device)):
+        raise NotAcceptedError
+    if value == "auto":
+        return value
+    try:
+        device = th.device(value)
+        if device.type == "meta":
+            raise NotAcceptedError
+        if device.type != "cuda" or th.cuda.is_available():
+            # SB3 takes the CPU where there is no GPU at all
+            th.empty(1, device=device)
+    except (RuntimeError, AssertionError, NotImplementedError) as error:
+        raise NotAcceptedError from error
+    return value
+
+
+def _read_activation(value: Any) -> Any:
+    if not (isinstance(value, str) or (isinstance(value, type) and issubclass(value, nn.Module))):
+        raise NotAcceptedError
+    if not isinstance(value, str):
+        try:
+            value()
+        except TypeError as error:
+            raise NotAcceptedError from error
+    return value
+
+
+def _needs_no_closure(value: type) -> bool:
+    closure = inspect.signature(value.step).parameters.get("closure")  # type: ignore[attr-defined]
+    return closure is None or closure.default is not closure.empty
+
+
+STEPS = integer(1, MOST_STEPS)
+SHARE = number(0.0, 1.0)
+WEIGHT = number(0.0, LARGEST_WEIGHT)
+RATE = schedule(WEIGHT)
+LAYERS_ACCEPTED = f"a list of at most {MOST_LAYERS} layer sizes from 1 to {_text(WIDEST_LAYER)}"
+LAYERS = sequence(integer(1, WIDEST_LAYER), LAYERS_ACCEPTED)
+
+
+def _read_networks(value: Any) -> Any:
+    if not isinstance(value, Mapping) or set(value) != {"pi", "qf"}:
+        raise NotAcceptedError
+    return {key: LAYERS.read(layers) for key, layers in value.items()}
+
+
+# The policy has them, too
+SHARED_ARGUMENTS: dict[str, Kind] = {
+    "diffusion_steps": integer(1, MOST_DIFFUSION_STEPS),
+    "noise_schedule": choice(NOISE_SCHEDULES),
+    "sampler": choice(SAMPLERS),
+    "ddim_eta": SHARE,
+    "n_action_candidates": integer(1, MOST_CANDIDATES),
+    "exploration_noise": number(0.0, LARGEST_NOISE),
+    "guidance": choice(GUIDANCE_MODES) | NONE,
+    "guidance_target": choice(GUIDANCE_TARGETS),
+    "guidance_covariance": choice(GUIDANCE_COVARIANCES),
+    "guidance_scale": WEIGHT | sequence(WEIGHT, "one of them for each diffusion step", 1, MOST_DIFFUSION_STEPS),
+    "state_guidance_scale": WEIGHT,
+    "outcome_guidance_scale": WEIGHT,
+}
+
+CONSTRUCTOR_ARGUMENTS: dict[str, Kind] = {
+    "policy": TEXT | subclass(BasePolicy, "a policy class"),
+    "env": TEXT | instance((gym.Env, VecEnv), "an environment") | NONE,
+    "learning_rate": RATE,
+    "buffer_size": integer(1, 10 * MOST_STEPS),
+    "learning_starts": integer(0, MOST_STEPS),
+    "batch_size": integer(1, MOST_GRADIENT_STEPS),
+    "tau": SHARE,
+    "gamma": SHARE,
+    "train_freq": Kind(f"{STEPS.accepted}, or a tuple of one and 'step' or 'episode'", _read_train_freq),
+    "gradient_steps": integer(-1, MOST_GRADIENT_STEPS),
+    "action_noise": instance(ActionNoise, "an ActionNoise") | NONE,
+    "replay_buffer_class": subclass(ReplayBuffer, "a subclass of ReplayBuffer") | NONE,
+    "replay_buffer_kwargs": KEYWORDS | NONE,
+    "optimize_memory_usage": FLAG,
+    "n_steps": integer(1, MOST_CANDIDATES),
+    "critic_learning_rate": RATE | NONE,
+    "world_model_learning_rate": RATE,
+    "eta": WEIGHT,
+    "denoising_weight": WEIGHT,
+    "actor_update": choice(ACTOR_UPDATES),
+    "q_scale": choice(Q_SCALES),
+    "bound_penalty": WEIGHT,
+    "policy_delay": STEPS,
+    "world_model_delay": STEPS,
+    "max_q_backup": FLAG,
+    "max_grad_norm": number(0.0, LARGEST_NUMBER, above=True) | NONE,
+    **SHARED_ARGUMENTS,
+    "causal_discovery": choice(DISCOVERY_METHODS) | FUNCTION,
+    "causal_discovery_kwargs": KEYWORDS | NONE,
+    "causal_refresh_freq": STEPS,
+    "causal_half_life": number(1.0, LARGEST_NUMBER) | NONE,
+    "causal_window": integer(8, MOST_STEPS) | NONE,
+    "sample_masks": FLAG,
+    "offline_dataset": PATH | NONE,
+    "pretrain_steps": integer(0, MOST_PRETRAIN_STEPS),
+    "offline_fraction": schedule(SHARE),
+    "reward_transform": choice(REWARD_TRANSFORMS),
+    "stats_window_size": integer(1, MOST_STEPS),
+    "tensorboard_log": PATH | NONE,
+    "policy_kwargs": KEYWORDS | NONE,
+    "compile": FLAG | _accepts("a mode of torch.compile", lambda value: isinstance(value, str) and value != ""),
+    "cuda_graph": FLAG | choice(["auto"]),
+    "torch_threads": integer(1, MOST_THREADS) | choice(["auto"]) | NONE,
+    "verbose": integer(0, MOST_STEPS) | FLAG,
+    "seed": integer(0, 2**32 - 1) | NONE,
+    "device": Kind("'auto' or a device that PyTorch has here, such as 'cpu' or 'cuda:0'", _read_device),
+    "_init_setup_model": FLAG,
+}
+"""Every argument of :class:`~sb3_causalgdp.CausalGDP`."""
+
+POLICY_ARGUMENTS: dict[str, Kind] = {
+    "observation_space": instance(spaces.Space, "a space of Gymnasium"),
+    "action_space": instance(spaces.Box, "a Box of Gymnasium"),
+    "lr_schedule": FUNCTION,
+    "net_arch": LAYERS | Kind("a dictionary of two such lists, 'pi' and 'qf',", _read_networks) | NONE,
+    "activation_fn": Kind("a class of torch.nn that needs no arguments, or its name", _read_activation),
+    "features_extractor_class": subclass(BaseFeaturesExtractor, "a subclass of BaseFeaturesExtractor"),
+    "features_extractor_kwargs": KEYWORDS | NONE,
+    "normalize_images": FLAG,
+    "optimizer_class": _accepts(
+        "a subclass of torch.optim.Optimizer whose step() needs no closure",
+        lambda value: isinstance(value, type) and issubclass(value, th.optim.Optimizer) and _needs_no_closure(value),
+    ),
+    "optimizer_kwargs": KEYWORDS | NONE,
+    "n_critics": integer(1, MOST_CRITICS),
+    "critic_layer_norm": FLAG,
+    "share_features_extractor": FLAG,
+    "world_model_net_arch": sequence(
+        integer(1, WIDEST_LAYER), f"a list of 1 to {MOST_LAYERS} equal layer sizes, like [128, 128],", shortest=1, equal=True
+    )
+    | NONE,
+    **SHARED_ARGUMENTS,
+    "discount": SHARE,
+}
+"""Every argument of :class:`~sb3_causalgdp.policies.CausalGDPPolicy`, what goes into ``policy_kwargs`` among them."""
+
+
+def check_arguments(table: Mapping[str, Kind], values: Mapping[str, Any]) -> dict[str, Any]:
+    """
+    :param table: What each argument accepts
+    :param values: What was given, by name; what is not in the table is left out
+    :return: What is to be stored, by name: numpy's numbers and arrays have become Python's
+    :raises ValueError: If a value is not accepted, with the argument's name, what was given and what is accepted
+    """
+    read = {}
+    for name, kind in table.items():
+        if name not in values:
+            continue
+        try:
+            read[name] = kind.read(values[name])
+        except NotAcceptedError:
+            raise ValueError(f"{name} must be {kind.accepted.rstrip(',')}, got {_shown(values[name])}") from None
+    return read
+
+
+def _shown(value: Any) -> str:
+    text = " ".join(repr(value).split())
+    return text if len(text) <= 100 else f"{text[:97]}..."
+
+
+def check_keywords(name: str, keywords: Iterable[str], function: Callable[..., Any]) -> None:
+    """
+    :param name: The argument that holds them
+    :param keywords: Names of arguments
+    :param function: A function or class that will be called with them
+    :raises TypeError: If it does not know one, with the one that may be meant, or those that it knows
+    """
+    parameters = inspect.signature(function).parameters.values()
+    if any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters):
+        return
+    known = [parameter.name for parameter in parameters]
+    unknown = [keyword for keyword in keywords if keyword not in known]
+    if unknown:
+        close = difflib.get_close_matches(unknown[0], known, n=1)
+        hint = f"did you mean {close[0]!r}?" if close else f"it has {known}"
+        raise TypeError(f"{name}: {getattr(function, '__name__', function)} has no argument {unknown[0]!r}, {hint}")
+
+
+def check_action_space(space: spaces.Space) -> None:
+    """
+    :param space: The environment's actions
+    :raises ValueError: If there are components that cannot be told from [-1, 1], or are fixed, or no floating point numbers
+    """
+    if not isinstance(space, spaces.Box):
+        raise ValueError(f"action_space must be a Box, got {space}")
+    if space.dtype not in (np.float32, np.float64):
+        raise ValueError(
+            f"action_space must be a Box of float32 or float64, got {space}: take real numbers, and round in the environment"
+        )
+    low, high = space.low.reshape(-1), space.high.reshape(-1)
+    scaled = np.linspace(-1.0, 1.0, 9, dtype=np.float32)[:, None]
+    with np.errstate(all="ignore"):
+        # To the environment's units and back, as SB3 does it
+        actions = low + 0.5 * (scaled + 1.0) * (high - low)
+        error = np.abs(2.0 * ((actions - low) / (high - low)) - 1.0 - scaled).max(axis=0)
+    bad = np.flatnonzero(~(error <= ACTION_PRECISION))
+    if len(bad) > 0:
+        index = int(bad[0])
+        why = "is fixed" if low[index] == high[index] else f"cannot be told from [-1, 1] in {space.dtype}"
+        raise ValueError(
+            f"action_space: component {index} from {low[index]:g} to {high[index]:g} {why}: leave it out, or let the "
+            "environment take it in other units, such as [-1, 1]"
+        )
