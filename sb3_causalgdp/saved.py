@@ -23,6 +23,7 @@ from sb3_causalgdp.causal.basis import BasisExpansion, BasisMoments
 from sb3_causalgdp.causal.discovery import DISCOVERY_METHODS
 from sb3_causalgdp.causal.discovery.perturbed import NoisyMoments, NoisyStatistics
 from sb3_causalgdp.causal.graph import CausalGraph
+from sb3_causalgdp.causal.grouped import GroupedStatistics
 from sb3_causalgdp.causal.moments import Moments, Spread, StreamingMoments
 from sb3_causalgdp.causal.recent_rows import RecentRows
 from sb3_causalgdp.causal.variables import TransitionVariables
@@ -39,7 +40,7 @@ KNOWN = Known(
         *(FloatSchedule, LinearSchedule, ConstantSchedule),
         *(NormalActionNoise, OrnsteinUhlenbeckActionNoise, VectorizedActionNoise),
         *(TrainFreq, TrainFrequencyUnit, GoalSelectionStrategy, RewardTransform),
-        *(BasisMoments, BasisExpansion, StreamingMoments, Moments, Spread, RecentRows, NoisyMoments, NoisyStatistics),
+        *(BasisMoments, BasisExpansion, StreamingMoments, Moments, Spread, RecentRows, NoisyMoments, NoisyStatistics, GroupedStatistics),
         *(TransitionVariables, CausalGraph, *DISCOVERY_METHODS.values()),
     ],
     named=[

@@ -21,8 +21,11 @@ from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 from torch import nn
 
 from sb3_causalgdp import CausalGDP, MlpPolicy
-from sb3_causalgdp.causal import CausalGraph
+from sb3_causalgdp.causal import DISCOVERY_METHODS, CausalGraph, TransitionVariables, make_discovery, make_statistics
+from sb3_causalgdp.causal.grouped import GroupedStatistics
 from sb3_causalgdp.causal.sources import open_source
+from sb3_causalgdp.plain import decoded
+from sb3_causalgdp.saved import KNOWN, plain_entries
 
 TINY = {
     "policy_kwargs": {"net_arch": [8], "world_model_net_arch": [8], "activation_fn": nn.ReLU},
@@ -96,6 +99,24 @@ def test_what_the_package_writes_comes_back_without_a_pickle(model, saved, monke
     totals = (loaded.causal_statistics.raw.total(), model.causal_statistics.raw.total())
     np.testing.assert_array_equal(*(total.comoment for total in totals))
     assert loaded.action_space.sample() == CausalGDP.load(saved, device="cpu").action_space.sample()
+
+
+@pytest.mark.parametrize("method", [*DISCOVERY_METHODS, "grouped"])
+@pytest.mark.parametrize("window", [None, 40])
+def test_no_statistics_need_a_pickle(method, window):
+    variables = TransitionVariables(tuple(f"s{i}" for i in range(3)), ("a",))
+    discovery = make_discovery("partial_r2" if method == "grouped" else method)
+    statistics = make_statistics(discovery, variables, None, window)
+    if method == "grouped":
+        statistics = GroupedStatistics(TransitionVariables(tuple(f"s{i}" for i in range(60)), ("a",)), None, window, 1e6)
+    rows = np.random.default_rng(0).normal(size=(230, statistics.variables.n_variables if method == "grouped" else 8))
+    statistics.update(rows)
+    names, entries = plain_entries({"causal_statistics": statistics}, KNOWN)
+    assert names == {"causal_statistics"}
+    back = decoded(json.loads(entries["plain.json"]), entries["plain.bin"], KNOWN)["causal_statistics"]
+    for one in (statistics, back):
+        one.update(rows[:50])
+    assert plain_entries({"causal_statistics": back}, KNOWN)[1] == plain_entries({"causal_statistics": statistics}, KNOWN)[1]
 
 
 def test_sb3_reads_the_zip_and_loads_the_model(model, saved):
@@ -172,7 +193,7 @@ def test_a_zip_of_an_older_version_needs_trust():
         ("pretrain_steps", 10**9, "pretrain_steps is 1e.09"),
         ("env", "some_module:Env-v0", "env is no attribute"),
         ("predict", 1, "predict is no attribute"),
-        ("causal_discovery", "os.system", "unknown discovery method"),
+        ("causal_discovery", "os.system", "causal_discovery must be one of"),
     ],
 )
 def test_a_zip_that_asks_for_too_much_is_refused(saved, tmp_path, name, value, message):
