@@ -153,7 +153,8 @@ class Writer:
             return {"enum": name, "value": self._encode(value.value, depth)}
         if isinstance(value, tuple):
             return {"object": name, "parts": [self._encode(one, depth) for one in value]}
-        return {"object": name, "state": {key: self._encode(one, depth) for key, one in vars(value).items()}}
+        state = value.__getstate__() if _has_own_state(kind) else vars(value)
+        return {"object": name, "state": {key: self._encode(one, depth) for key, one in state.items()}}
 
 
 class Reader:
@@ -267,7 +268,11 @@ class Reader:
         if issubclass(cls, enum.Enum | tuple):
             raise ValueError(f"{value['object']} has no attributes")
         instance = cls.__new__(cls)
-        vars(instance).update({str(key): self._decode(one) for key, one in value["state"].items()})
+        state = {str(key): self._decode(one) for key, one in value["state"].items()}
+        if _has_own_state(cls):
+            instance.__setstate__(state)
+        else:
+            vars(instance).update(state)
         if isinstance(instance, spaces.Space):
             _check_space(instance)
         check = getattr(cls, "__post_init__", None)
@@ -281,6 +286,12 @@ class Reader:
         if not isinstance(name, str) or name not in classes:
             raise ValueError(f"it names {str(name)[:200]!r}, which is none of the classes that are known to be harmless")
         return classes[name]
+
+
+def _has_own_state(cls: type) -> bool:
+    """Whether a class says itself what of its objects is written."""
+    own = getattr(cls, "__getstate__", None)
+    return own is not None and own is not getattr(object, "__getstate__", None) and hasattr(cls, "__setstate__")
 
 
 def _check_space(space: Any) -> None:

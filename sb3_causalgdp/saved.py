@@ -40,7 +40,17 @@ KNOWN = Known(
         *(FloatSchedule, LinearSchedule, ConstantSchedule),
         *(NormalActionNoise, OrnsteinUhlenbeckActionNoise, VectorizedActionNoise),
         *(TrainFreq, TrainFrequencyUnit, GoalSelectionStrategy, RewardTransform),
-        *(BasisMoments, BasisExpansion, StreamingMoments, Moments, Spread, RecentRows, NoisyMoments, NoisyStatistics, GroupedStatistics),
+        *(
+            BasisMoments,
+            BasisExpansion,
+            StreamingMoments,
+            Moments,
+            Spread,
+            RecentRows,
+            NoisyMoments,
+            NoisyStatistics,
+            GroupedStatistics,
+        ),
         *(TransitionVariables, CausalGraph, *DISCOVERY_METHODS.values()),
     ],
     named=[
