@@ -47,8 +47,6 @@ ACTIVATIONS: dict[str, type[nn.Module]] = {
 
 SelfPolicy = TypeVar("SelfPolicy", bound="CausalGDPPolicy")
 
-SelfPolicy = TypeVar("SelfPolicy", bound="CausalGDPPolicy")
-
 
 def activation_class(activation_fn: str | type[nn.Module]) -> type[nn.Module]:
     """
