@@ -15,13 +15,15 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
+from sb3_causalgdp.numpy_pickles import in_place_of
+
 # What bookkeeping is made of; none of it runs what a file says
 PLAIN: dict[str, set[str]] = {
     "builtins": {"bytearray", "complex", "frozenset", "object", "range", "set", "slice"},
     "collections": {"OrderedDict", "defaultdict", "deque"},
     "copyreg": {"_reconstructor"},
     "_codecs": {"encode"},
-    "numpy": {"dtype", "ndarray", *(kind.__name__ for kind in np.sctypeDict.values())},
+    "numpy": {"dtype", "ndarray", *(kind.__name__ for kind in np.sctypeDict.values() if np.dtype(kind).kind in "biufc")},
     "numpy._core.multiarray": {"_reconstruct", "scalar"},
     "numpy.core.multiarray": {"_reconstruct", "scalar"},
     "numpy._core.numeric": {"_frombuffer"},
@@ -71,14 +73,18 @@ def one_line(error: BaseException) -> str:
     """
     text = " ".join(str(error).split())
     text = text if len(text) <= LONGEST_TEXT else f"{text[:LONGEST_TEXT]}..."
-    return text if type(error) is ValueError and text else f"{type(error).__name__}: {text}".removesuffix(": ")
+    return text if type(error) in (ValueError, FileError) and text else f"{type(error).__name__}: {text}".removesuffix(": ")
+
+
+class FileError(ValueError):
+    """What is wrong with a file, in one line that names it."""
 
 
 @contextmanager
 def errors_of(path: Any, what: str = "cannot be read") -> Iterator[None]:
     """
-    Whatever is raised while a file is read becomes one ValueError of one line, which names the file. Missing files, missing
-    rights and missing packages stay what they are.
+    Whatever is raised while a file is read becomes one :class:`FileError`. Missing files, missing rights and missing packages
+    stay what they are.
 
     :param path: The file
     :param what: What is said of it
@@ -89,7 +95,7 @@ def errors_of(path: Any, what: str = "cannot be read") -> Iterator[None]:
         raise
     except Exception as error:
         name, text = named(path), one_line(error)
-        raise ValueError(text if text.startswith(name) else f"{name} {what}: {text}") from error
+        raise FileError(text if text.startswith(name) else f"{name} {what}: {text}") from error
 
 
 def checked_entries(archive: zipfile.ZipFile, size: int, small: int = SMALL) -> list[zipfile.ZipInfo]:
@@ -225,7 +231,7 @@ class _Unpickler(pickle.Unpickler):
 
     def find_class(self, module: str, name: str) -> Any:
         if name in PLAIN.get(module, ()) or name in self.known.get(module, ()):
-            return super().find_class(module, name)
+            return in_place_of(module, name, super().find_class)
         raise ValueError(f"it holds {module}.{name}, which could run code: {TRUST}")
 
     def persistent_load(self, reference: Any) -> Any:

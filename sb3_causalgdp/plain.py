@@ -11,6 +11,8 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
+from sb3_causalgdp.numpy_pickles import check_random_state
+
 SPACES: tuple[type, ...] = (
     spaces.Box,
     spaces.Dict,
@@ -241,13 +243,15 @@ class Reader:
 
     def _generator(self, value: dict) -> np.random.Generator:
         state = self._decode(value["generator"])
+        check_random_state(state)
         generator = np.random.Generator(BIT_GENERATORS[state["bit_generator"]]())
         generator.bit_generator.state = state
         return generator
 
     def _random_state(self, value: dict) -> np.random.RandomState:
-        generator = np.random.RandomState()
-        generator.set_state(self._decode(value["random_state"]))
+        generator, state = np.random.RandomState(), self._decode(value["random_state"])
+        check_random_state(state)
+        generator.set_state(state)
         return generator
 
     def _class(self, value: dict) -> type:

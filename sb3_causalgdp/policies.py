@@ -7,7 +7,7 @@ from typing import Any, BinaryIO, TypeVar
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.policies import BasePolicy, ContinuousCritic
+from stable_baselines3.common.policies import BaseModel, BasePolicy, ContinuousCritic
 from stable_baselines3.common.preprocessing import get_action_dim, is_image_space, preprocess_obs
 from stable_baselines3.common.torch_layers import (
     BaseFeaturesExtractor,
@@ -23,7 +23,7 @@ from torch import nn
 
 from sb3_causalgdp.acting import NumpyActing
 from sb3_causalgdp.activations import fast
-from sb3_causalgdp.archives import TRUST, errors_of, opened, size_of
+from sb3_causalgdp.archives import TRUST, FileError, errors_of, named, opened, size_of
 from sb3_causalgdp.arguments import POLICY_ARGUMENTS, check_arguments, check_keywords
 from sb3_causalgdp.causal import CausalGuidance, LinearisedGuidance, MaskedWorldModel, ReturnTarget, RewardTarget
 from sb3_causalgdp.causal.guidance import OutcomeTarget
@@ -46,6 +46,7 @@ ACTIVATIONS: dict[str, type[nn.Module]] = {
 }
 
 SelfPolicy = TypeVar("SelfPolicy", bound="CausalGDPPolicy")
+SelfNetwork = TypeVar("SelfNetwork", bound="_PickledAlone")
 
 
 def activation_class(activation_fn: str | type[nn.Module]) -> type[nn.Module]:
@@ -79,7 +80,30 @@ def q_values(
     return [network(inputs) for network in critic.q_networks[networks]]
 
 
-class Critic(ContinuousCritic):
+class _PickledAlone(BaseModel):
+    """A network that SB3 saves as a pickle, because it holds another one; a whole policy needs none."""
+
+    @classmethod
+    def load(  # type: ignore[override]
+        cls: type[SelfNetwork], path: Any, device: th.device | str = "auto", *, trusted: bool = False
+    ) -> SelfNetwork:
+        """
+        Load a network that was saved alone.
+
+        :param path: File, or file-like object
+        :param device: Device on which the network should be
+        :param trusted: Whether the file may bring Python objects that could run code
+        :return: The network
+        :raises ValueError: If the file is not trusted
+        """
+        if not trusted:
+            raise FileError(
+                f"{named(path)} is a pickle, which could run code: {TRUST}, or save the whole policy, which is none"
+            )
+        return super().load(path, device)
+
+
+class Critic(_PickledAlone, ContinuousCritic):
     """
     SB3's critics, with layer normalisation between each hidden layer and its activation if asked for.
 
@@ -99,7 +123,7 @@ class Critic(ContinuousCritic):
             make_layers_fast(network)
 
 
-class DiffusionActor(BasePolicy):
+class DiffusionActor(_PickledAlone, BasePolicy):
     """
     Diffusion policy: denoises actions, conditioned on the features of the observation.
 

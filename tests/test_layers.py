@@ -19,6 +19,7 @@ LAYERS = [
     {"acting", "arguments", "saved"},
     {"causal", "offline", "diffusion"},
     {"checks", "divergence", "files", "products", "activations", "plain", "archives"},
+    {"numpy_pickles"},
 ]
 WITHOUT_SB3 = {
     "causal",

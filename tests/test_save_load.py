@@ -619,7 +619,7 @@ def test_the_policy_alone_predicts_the_same_with_its_guidance(trained, tmp_path,
 
 def test_the_actor_alone_predicts_the_same(trained, tmp_path, observations):
     trained.actor.save(tmp_path / "actor.pth")
-    actor = type(trained.actor).load(tmp_path / "actor.pth", device="cpu")
+    actor = type(trained.actor).load(tmp_path / "actor.pth", device="cpu", trusted=True)
     assert_same_predictions(trained.actor, actor, observations)
 
 

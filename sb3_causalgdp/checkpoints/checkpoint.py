@@ -28,6 +28,7 @@ from sb3_causalgdp.checkpoints.pickles import classes_in, from_bytes, to_bytes
 from sb3_causalgdp.checkpoints.store import Checkpoint, open_checkpoint, run_of, write_checkpoint
 from sb3_causalgdp.checkpoints.transitions import FOLDER, Log, rest_of, set_rest
 from sb3_causalgdp.files import replaced_when_done, temporary_folder
+from sb3_causalgdp.numpy_pickles import check_random_state
 
 SelfAlgorithm = TypeVar("SelfAlgorithm", bound=OffPolicyAlgorithm)
 
@@ -351,11 +352,13 @@ def fresh_seed(model: OffPolicyAlgorithm) -> int:
 
 def _set_generators(model: OffPolicyAlgorithm, states: dict[str, Any]) -> None:
     random.setstate(states["python"])
+    check_random_state(states["numpy"])
     np.random.set_state(states["numpy"])
     th.set_rng_state(th.from_numpy(states["torch"].copy()))
     if th.cuda.is_available() and len(states["cuda"]) == th.cuda.device_count():
         th.cuda.set_rng_state_all([th.from_numpy(state.copy()) for state in states["cuda"]])
     if states["actions"] is not None:
+        check_random_state(states["actions"])
         model.action_space.np_random.bit_generator.state = states["actions"]
 
 

@@ -13,8 +13,9 @@ from typing import NoReturn
 import gymnasium as gym
 
 from sb3_causalgdp import TrainingDivergedError
+from sb3_causalgdp.archives import FileError
 from sb3_causalgdp.offline.registration import register_environments
-from sb3_causalgdp.zoo.registration import ZOO_HINT, SetupError, register
+from sb3_causalgdp.zoo.registration import TRUST_OPTION, ZOO_HINT, SetupError, register
 from sb3_causalgdp.zoo.scripts import surroundings
 
 PROGRAM = "causalgdp-zoo"
@@ -51,10 +52,13 @@ def main(argv: Sequence[str] | None = None) -> None:
         return
     if script not in SCRIPTS:
         _fail(PROGRAM, f"unknown script {script!r}, it must be one of {', '.join(SCRIPTS)}")
+    trusted = TRUST_OPTION in arguments
+    if script != "report":
+        arguments = [one for one in arguments if one != TRUST_OPTION]
     before, sys.argv = sys.argv, [f"{PROGRAM} {script}", *arguments]
     try:
-        _prepare(script, arguments)
-        with surroundings(script):
+        _prepare(script, arguments, trusted)
+        with surroundings(script, trusted):
             _run(script, arguments)
     except KeyboardInterrupt:
         sys.exit(130)
@@ -76,12 +80,13 @@ def _usage() -> str:
             *(f"  {name:<{width}}  {what}" for name, what in SCRIPTS.items()),
             "",
             f"{PROGRAM} SCRIPT --help lists the arguments of a script; --traceback shows where an error comes from.",
+            f"{TRUST_OPTION}, behind SCRIPT, lets the files of runs bring code, as your own may.",
         ]
     )
 
 
-def _prepare(script: str, arguments: Sequence[str]) -> None:
-    register(for_playing=script in PLAYING)
+def _prepare(script: str, arguments: Sequence[str], trusted: bool) -> None:
+    register(script in PLAYING, trusted)
     register_environments()
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     parser.add_argument("--env", default="")
@@ -102,7 +107,7 @@ def _run(script: str, arguments: Sequence[str]) -> None:
 
 def _is_about_usage(error: Exception) -> bool:
     """Whether the message says it all: what RL Zoo itself complains about, what is not installed, what is not on the hub."""
-    if isinstance(error, SetupError | TrainingDivergedError | ImportError | gym.error.Error):
+    if isinstance(error, SetupError | FileError | TrainingDivergedError | ImportError | gym.error.Error):
         return True
     frames = _frames(error)
     if any(name in Path(frame.filename).parts for frame in frames for name in HUB_PACKAGES):
@@ -118,7 +123,7 @@ def _frames(error: BaseException) -> list[traceback.FrameSummary]:
 
 
 def _one_line(error: Exception, arguments: Sequence[str]) -> str:
-    text = " ".join(str(error).split())
+    text = " ".join(str(error).split()).replace("pass trusted=True", f"add {TRUST_OPTION}")
     if not text or isinstance(error, KeyError | NameError | SyntaxError):
         text = f"{type(error).__name__}: {text}"
     if isinstance(error, ModuleNotFoundError) and error.name not in arguments:

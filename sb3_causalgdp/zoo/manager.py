@@ -18,7 +18,7 @@ from typing import Any
 import optuna
 import torch as th
 import yaml
-from rl_zoo3 import exp_manager
+from rl_zoo3 import ALGOS, exp_manager
 from rl_zoo3.exp_manager import ExperimentManager
 from rl_zoo3.utils import get_latest_run_id
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -34,7 +34,7 @@ from sb3_causalgdp.zoo.going_on import FOLDER as CHECKPOINTS
 from sb3_causalgdp.zoo.going_on import RunLock, cut_monitors, interrupted_run, new_folder, write_command
 from sb3_causalgdp.zoo.hyperparameters import SCHEDULES, hyperparameter_file, make_schedule, merged, read_entry
 from sb3_causalgdp.zoo.offline_tasks import OFFLINE_TASKS
-from sb3_causalgdp.zoo.registration import ALGORITHM, SetupError
+from sb3_causalgdp.zoo.registration import ALGORITHM, SetupError, TrustingCausalGDP
 from sb3_causalgdp.zoo.scripts import replaced
 from sb3_causalgdp.zoo.search_space import sample_causalgdp_params
 from sb3_causalgdp.zoo.versions import installed_versions
@@ -152,11 +152,14 @@ class CausalGDPExperimentManager(ExperimentManager):
 
     def _load_pretrained_agent(self, hyperparams: dict[str, Any], env: VecEnv) -> BaseAlgorithm:
         if self.algo == ALGORITHM and (self._manifest is not None or is_checkpoint(Path(self.trained_agent))):
-            return CausalGDP.resume(self.trained_agent, env, self.device)
+            trusted = ALGOS[ALGORITHM] is TrustingCausalGDP
+            return CausalGDP.resume(self.trained_agent, env, self.device, trusted=trusted)
         model = super()._load_pretrained_agent(hyperparams, env)
         if isinstance(model, CausalGDP):
             # The steps of the new run begin at 0, and so does the history that it saves
             model.causal_graph_history = []
+            # What it writes is of that name
+            model.__class__ = CausalGDP
         return model
 
     def save_trained_model(self, model: BaseAlgorithm) -> None:

@@ -9,6 +9,7 @@ from sb3_causalgdp.zoo.offline_tasks import register_offline_tasks
 
 ALGORITHM = "causalgdp"
 ZOO_HINT = 'pip install "sb3_causalgdp[zoo]"'
+TRUST_OPTION = "--trusted"
 
 
 class SetupError(Exception):
@@ -23,6 +24,21 @@ class WithoutReplayBuffer(CausalGDP):
         return super().load(*args, **{"buffer_size": 1, "optimize_memory_usage": False, **kwargs})
 
 
+class TrustingCausalGDP(CausalGDP):
+    """CausalGDP for files that may run code."""
+
+    @classmethod
+    def load(cls, *args: Any, **kwargs: Any) -> Any:
+        return super().load(*args, **{"trusted": True, **kwargs})
+
+    def load_replay_buffer(self, *args: Any, **kwargs: Any) -> None:
+        super().load_replay_buffer(*args, **{"trusted": True, **kwargs})
+
+
+class TrustingWithoutReplayBuffer(WithoutReplayBuffer, TrustingCausalGDP):
+    """The same for playing."""
+
+
 def need_zoo(module: str) -> Any:
     """
     :param module: A module of RL Zoo
@@ -35,19 +51,21 @@ def need_zoo(module: str) -> Any:
         raise ImportError(f"RL Zoo cannot be imported ({error}): {ZOO_HINT}") from error
 
 
-def register(for_playing: bool = False) -> None:
+def register(for_playing: bool = False, trusted: bool = False) -> None:
     """
     Add CausalGDP to RL Zoo's algorithms, search spaces and hyperparameter files, in this process. Call it before RL Zoo parses
     a command line.
 
     :param for_playing: Whether models are loaded to be played, not trained
+    :param trusted: Whether their files may run code
     :raises ImportError: Without RL Zoo
     """
     zoo, manager = need_zoo("rl_zoo3"), need_zoo("rl_zoo3.exp_manager")
     from sb3_causalgdp.zoo.manager import CausalGDPExperimentManager
     from sb3_causalgdp.zoo.search_space import convert_causalgdp_params, sample_causalgdp_params
 
-    zoo.ALGOS[ALGORITHM] = WithoutReplayBuffer if for_playing else CausalGDP
+    plain, trusting = (WithoutReplayBuffer, TrustingWithoutReplayBuffer) if for_playing else (CausalGDP, TrustingCausalGDP)
+    zoo.ALGOS[ALGORITHM] = trusting if trusted else plain
     manager.HYPERPARAMS_SAMPLER[ALGORITHM] = sample_causalgdp_params
     manager.HYPERPARAMS_CONVERTER[ALGORITHM] = convert_causalgdp_params
     for name in ("exp_manager", "train", "enjoy"):

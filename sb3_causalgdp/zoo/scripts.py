@@ -8,8 +8,10 @@ import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
+from sb3_causalgdp.archives import errors_of, read_pickle
 from sb3_causalgdp.zoo.registration import ALGORITHM, ZOO_HINT
 from sb3_causalgdp.zoo.settings import safe_files
 
@@ -135,23 +137,46 @@ def optional_hub_files() -> Iterator[None]:
         yield
 
 
+@contextmanager
+def plain_results() -> Iterator[None]:
+    """What ``all_plots`` wrote is read without running anything."""
+    import rl_zoo3.plots.plot_from_file as _  # noqa: F401 (the module behind the function of that name)
+
+    module = sys.modules["rl_zoo3.plots.plot_from_file"]
+
+    def load(file: Any) -> Any:
+        with errors_of(file.name, "cannot be read as results"):
+            return read_pickle(file)
+
+    with replaced(module, "pickle", SimpleNamespace(load=load)):
+        yield
+
+
 SURROUNDINGS: dict[str, list[Callable[[], Any]]] = {
-    "benchmark": [own_commands, optional_hub_files],
+    "benchmark": [own_commands, optional_hub_files, safe_files],
     "enjoy": [optional_hub_files, safe_files],
     "load_from_hub": [optional_hub_files],
+    "plot_from_file": [plain_results],
     "push_to_hub": [safe_files, model_card_metadata, own_model_card, ffmpeg_on_path],
     "record_video": [safe_files],
     "record_training": [own_commands, ffmpeg_on_path],
+    "train": [safe_files],
 }
 """By script."""
 
 
+OF_STRANGERS = (safe_files, plain_results)
+"""What is left out where files are trusted."""
+
+
 @contextmanager
-def surroundings(script: str) -> Iterator[None]:
+def surroundings(script: str, trusted: bool = False) -> Iterator[None]:
     """
     :param script: Name of a script of RL Zoo, which runs inside
+    :param trusted: Whether the files that it reads may run code
     """
     with ExitStack() as stack:
         for make in SURROUNDINGS.get(script, []):
-            stack.enter_context(make())
+            if not (trusted and make in OF_STRANGERS):
+                stack.enter_context(make())
         yield

@@ -1,14 +1,17 @@
 """Files of RL Zoo's runs, read without running what they bring: YAML with Python's tags, and saved normalizations."""
 
 import ast
+import importlib
+import math
 from collections import OrderedDict
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import yaml
-from stable_baselines3.common.vec_env import VecEnv, VecNormalize
+from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecNormalize
 
 from sb3_causalgdp.archives import errors_of, read_pickle
 
@@ -17,8 +20,50 @@ TAG = "tag:yaml.org,2002:python/"
 HARMLESS = ("gymnasium", "gymnasium_robotics", "minari", "rl_zoo3", "sb3_causalgdp", "sb3_contrib", "stable_baselines3")
 
 
+# Of a file, with what an alias repeats
+MOST_VALUES = 100_000
+
+
 class PlainLoader(yaml.SafeLoader):
     """YAML, and those of Python's tags that are data: what RL Zoo writes."""
+
+    def get_single_data(self) -> Any:
+        """
+        :return: What the file says
+        :raises ValueError: If aliases make it grow without end
+        """
+        node = self.get_single_node()
+        if node is None:
+            return None
+        if _n_values(node, {}) > MOST_VALUES:
+            raise ValueError(f"it holds more than {MOST_VALUES:,} values, with what its aliases repeat")
+        return self.construct_document(node)
+
+
+def _n_values(node: yaml.Node, known: dict[int, float]) -> float:
+    if id(node) not in known:
+        # Until it is known, so that what holds itself has no end
+        known[id(node)] = math.inf
+        children = node.value if isinstance(node, yaml.CollectionNode) else []
+        parts = [part for child in children for part in (child if isinstance(child, tuple) else (child,))]
+        known[id(node)] = 1 + sum(_n_values(part, known) for part in parts)
+    return known[id(node)]
+
+
+class ZooLoader(PlainLoader):
+    """The same in place of the loader of RL Zoo, which evaluates and imports what settings say."""
+
+    def get_single_data(self) -> Any:
+        """
+        :return: What the file says
+        :raises FileError: If it cannot be read, or would run code
+        """
+        with errors_of(self.name, "cannot be read as YAML"):
+            settings = super().get_single_data()
+            check_normalize(settings)
+            if isinstance(settings, Mapping):
+                check_modules(settings, {})
+            return settings
 
 
 def _tuple(loader: PlainLoader, node: Any) -> tuple:
@@ -112,29 +157,31 @@ def check_modules(settings: Mapping[str, Any], arguments: Mapping[str, Any]) -> 
         wrappers = settings.get(key) or []
         for wrapper in wrappers if isinstance(wrappers, list) else [wrappers]:
             names.append(str(next(iter(wrapper), "") if isinstance(wrapper, Mapping) else wrapper))
+            _check_wrapper(names[-1])
     for name in names:
         if name.partition(".")[0] not in HARMLESS:
             raise ValueError(f"the run names the module of {name!r}, which could run code: if you trust it, use --trusted")
 
 
+def _check_wrapper(name: str) -> None:
+    """Of a harmless module, what is called has to be a wrapper."""
+    module, _, attribute = name.rpartition(".")
+    if module.partition(".")[0] not in HARMLESS:
+        return
+    try:
+        wrapper = getattr(importlib.import_module(module), attribute)
+    except (ImportError, AttributeError):
+        return  # RL Zoo says so
+    if not (isinstance(wrapper, type) and issubclass(wrapper, gym.Wrapper | VecEnvWrapper)):
+        raise ValueError(f"the run names {name!r}, which is no wrapper and could run code: if you trust it, use --trusted")
+
+
 @contextmanager
 def safe_files() -> Iterator[None]:
     """RL Zoo reads YAML and normalizations of runs as its own files, which run what they hold."""
-    import rl_zoo3.utils as zoo
-
     from sb3_causalgdp.zoo.scripts import replaced
 
-    read = zoo.get_saved_hyperparams
-
-    def read_checked(stats_path: str, *args: Any, **kwargs: Any) -> Any:
-        path = Path(stats_path, "config.yml")
-        if path.is_file():
-            with errors_of(path):
-                check_normalize(read_settings(path))
-        return read(stats_path, *args, **kwargs)
-
     with ExitStack() as stack:
-        stack.enter_context(replaced(yaml, "UnsafeLoader", PlainLoader))
+        stack.enter_context(replaced(yaml, "UnsafeLoader", ZooLoader))
         stack.enter_context(replaced(VecNormalize, "load", staticmethod(load_normalizer)))
-        stack.enter_context(replaced(zoo, "get_saved_hyperparams", read_checked))
         yield
