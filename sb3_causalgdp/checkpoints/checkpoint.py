@@ -244,7 +244,7 @@ def resume(
     """
     with open_checkpoint(Path(path)) as checkpoint:
         # SB3's own algorithms trust every file
-        trust = {"trusted": trusted} if "trusted" in inspect.signature(algorithm.load).parameters else {}
+        trust: dict[str, Any] = {"trusted": trusted} if "trusted" in inspect.signature(algorithm.load).parameters else {}
         with checkpoint.read(MODEL) as file, errors_of(checkpoint.path, "cannot be resumed"):
             model = algorithm.load(io.BytesIO(file.read()), env=env, device=device, force_reset=False, **trust)
         _check(model, checkpoint)

@@ -139,7 +139,7 @@ class _Unpickler(pickle.Unpickler):
             known = functools.reduce(getattr, name.split("."), importlib.import_module(module))  # type: ignore[assignment]
         if known is None:
             raise _refused(module, name)
-        return known.__new__(known)
+        return known.__new__(known)  # type: ignore[call-overload]
 
 
 def _refused(module: str, name: str) -> ValueError:
