@@ -183,7 +183,7 @@ def write_arrays(file: Any, arrays: Mapping[str, np.ndarray]) -> None:
             values = np.asarray(values, order="C")
             with archive.open(f"{name}.npy", "w", force_zip64=True) as content:
                 np.lib.format.write_array_header_1_0(content, np.lib.format.header_data_from_array_1_0(values))
-                content.write(values.reshape(-1).view(np.uint8).data)
+                content.write(memoryview(values.reshape(-1).view(np.uint8).data))
 
 
 def _read_array(content: Any, entry: zipfile.ZipInfo, name: str, stream: BinaryIO) -> np.ndarray:

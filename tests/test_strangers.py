@@ -316,6 +316,8 @@ def test_buffers_come_back(model, tmp_path, suffix):
         np.testing.assert_array_equal(getattr(buffer, name), getattr(other, name))
     assert (buffer.pos, buffer.full, buffer.buffer_size) == (other.pos, other.full, other.buffer_size)
     assert open_source(path).n_rows == 230
+    with pytest.warns(UserWarning, match="was saved after 230 steps, the model after 0"):
+        CausalGDP("MlpPolicy", "Pendulum-v1", **TINY).load_replay_buffer(path)
     assert make_preloaded(path).offline_buffer.size() == 230
 
 

@@ -123,7 +123,7 @@ def train(run: Run) -> None:
             self.env.seed(10_000 + run.seed)
             mean, std = evaluate_policy(self.model, self.env, n_eval_episodes=run.episodes, warn=False)
             th.set_rng_state(state)
-            values = (self.num_timesteps, mean, std, *self.spent)
+            values: tuple[Any, ...] = (self.num_timesteps, mean, std, *self.spent)
             self.rows = [*self.rows, tuple(round(float(value), 3) for value in values)]
             with replaced_when_done(run.result) as file, file.open("w", newline="") as stream:
                 writer = csv.writer(stream, lineterminator="\n")

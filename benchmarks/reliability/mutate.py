@@ -80,7 +80,11 @@ def write_files(folder: Path) -> None:
 def _model(**kwargs: Any) -> Any:
     from sb3_causalgdp import CausalGDP
 
-    tiny = {"policy_kwargs": {"net_arch": [8], "world_model_net_arch": [8]}, "batch_size": 8, "diffusion_steps": 2}
+    tiny: dict[str, Any] = {
+        "policy_kwargs": {"net_arch": [8], "world_model_net_arch": [8]},
+        "batch_size": 8,
+        "diffusion_steps": 2,
+    }
     return CausalGDP(
         "MlpPolicy", "Pendulum-v1", **tiny, buffer_size=300, causal_refresh_freq=250, device="cpu", seed=0, **kwargs
     )

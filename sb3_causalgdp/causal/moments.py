@@ -186,7 +186,7 @@ def check_rows(rows: npt.ArrayLike, names: Sequence[str]) -> np.ndarray:
         raise ValueError(f"rows must have shape (N, {len(names)}), got {rows.shape}")
     bad = ~(np.abs(rows) < LARGEST_VALUE)
     if bad.any():
-        variables = [names[i] for i in np.flatnonzero(bad.any(axis=0))]
+        variables = [names[i] for i in np.flatnonzero(bad.any(axis=0)).tolist()]
         row = int(np.flatnonzero(bad.any(axis=1))[0])
         raise ValueError(f"rows must be finite (below {LARGEST_VALUE:g}): first bad row {row}, bad variables {variables}")
     return rows

@@ -355,7 +355,8 @@ def _open_file(path: Path, max_rows: int | None, trusted: bool) -> TransitionSou
     missing = [name for name in ARRAYS if name not in arrays]
     if missing:
         raise SourceError(f"{path} lacks the arrays {missing}: it needs {list(ARRAYS)}")
-    return ArraySource(**{name: arrays[name] for name in ARRAYS}, name=str(path), max_rows=max_rows)  # type: ignore[arg-type]
+    columns = {name: arrays[name] for name in ARRAYS}
+    return ArraySource(*columns.values(), name=str(path), max_rows=max_rows)  # type: ignore[misc, arg-type]
 
 
 def _saved_buffer(arrays: dict[str, np.ndarray], prefix: str = "") -> Any:

@@ -129,7 +129,7 @@ def _read(layers: list[Any], names: list[tuple[str, ...]]) -> tuple[State, list[
         [name for name in of_layer if name in vars(layer) and vars(layer)[name] is None and name not in MADE_ANEW]
         for layer, of_layer in zip(layers, names, strict=True)
     ]
-    references = {id(layer): ("layer", index) for index, layer in enumerate(layers)}
+    references: dict[int, tuple[Any, ...]] = {id(layer): ("layer", index) for index, layer in enumerate(layers)}
     for index, of_layer in enumerate(values):
         for name, value in of_layer.items():
             if _is_filled_in_place(value):

@@ -437,12 +437,13 @@ class OfflineToOnlineAlgorithm(OffPolicyAlgorithm):
         :param truncate_last_traj: See SB3's ``load_replay_buffer``, for ``HerReplayBuffer``
         :param trusted: Whether a pickle may hold more than the replay buffers of SB3, which could run code
         :raises ValueError: If the file is not whole, or not trusted and needs to be; if the buffer is of another environment,
-            is damaged, holds NaN or infinite values, or is of another number of environments and cannot be brought to the
-            model's
+            is damaged, holds NaN or infinite values, or is of another number of environments and cannot be brought to that of
+            the model
         """
-        source = existing(path, SUFFIXES) if isinstance(path, str | os.PathLike) else path
-        name = str(path) if isinstance(path, str | os.PathLike) else "The replay buffer"
-        self._use_loaded_buffer(read_buffer(source, trusted), name, truncate_last_traj)
+        name = "The replay buffer"
+        if isinstance(path, str | os.PathLike):
+            name, path = str(path), existing(path, SUFFIXES)
+        self._use_loaded_buffer(read_buffer(path, trusted), name, truncate_last_traj)
 
     def _use_loaded_buffer(self, buffer: ReplayBuffer, name: str, truncate_last_traj: bool) -> None:
         """All or nothing."""

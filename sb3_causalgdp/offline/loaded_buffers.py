@@ -46,9 +46,12 @@ def _check_spaces(buffer: ReplayBuffer, observation_space: spaces.Space, action_
         )
     given, wanted = buffer.action_space, action_space
     assert isinstance(wanted, spaces.Box)
-    same = isinstance(given, spaces.Box) and given.shape == wanted.shape
     # Actions are stored scaled from these bounds
-    if not same or not np.allclose([given.low, given.high], [wanted.low, wanted.high]):
+    if not (
+        isinstance(given, spaces.Box)
+        and given.shape == wanted.shape
+        and np.allclose([given.low, given.high], [wanted.low, wanted.high])
+    ):
         raise ValueError(f"{name} is of another environment: its action space is {given}, and the model's is {wanted}")
 
 

@@ -134,7 +134,11 @@ def _one_buffer(arrays: dict[str, np.ndarray], name_of_buffer: str) -> tuple[Rep
         raise ValueError("it says of no replay buffer what it is")
     content = decoded(read_json(arrays.pop(CONTENT).tobytes()), arrays.pop(BLOCK).tobytes(), KNOWN)
     buffer = _empty(content)
-    vars(buffer).update({name: content[name] for name in vars(buffer) if name in content})
+    # The last is what our algorithm adds
+    names = [name for name in (*vars(buffer), "saved_after") if name in content]
+    if type(content.get("saved_after", 0)) is not int:
+        raise ValueError(f"saved_after must be a number of steps, got {str(content['saved_after'])[:80]}")
+    vars(buffer).update({name: content[name] for name in names})
     _fill(buffer, arrays)
     check_columns(buffer, name_of_buffer)
     return buffer, content
