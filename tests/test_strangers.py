@@ -321,6 +321,19 @@ def test_buffers_come_back(model, tmp_path, suffix):
     assert make_preloaded(path).offline_buffer.size() == 230
 
 
+@pytest.mark.parametrize("suffix", [".npz", ".pkl"])
+def test_the_preloaded_part_comes_back(model, tmp_path, suffix):
+    model.save_replay_buffer(tmp_path / "first.npz")
+    both = make_preloaded(tmp_path / "first.npz").learn(40)
+    both.save_replay_buffer(tmp_path / f"both{suffix}")
+    assert open_source(tmp_path / f"both{suffix}").n_rows == 230 + 40
+    assert make_preloaded(tmp_path / f"both{suffix}").offline_buffer.size() == 230 + 40
+    other = CausalGDP("MlpPolicy", "Pendulum-v1", **TINY)
+    other.load_replay_buffer(tmp_path / f"both{suffix}")
+    assert (other.offline_buffer.size(), other.replay_buffer.size()) == (230, 40)
+    assert other._offline_marks == both._offline_marks
+
+
 def make_preloaded(path):
     return CausalGDP("MlpPolicy", "Pendulum-v1", **TINY).preload(path)
 
