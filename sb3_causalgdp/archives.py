@@ -205,7 +205,7 @@ def _read_array(content: Any, entry: zipfile.ZipInfo, name: str, stream: BinaryI
     if count < 0 or count * dtype.itemsize != left:
         raise ValueError(f"the array {name!r} of shape {shape} and {dtype} has {left} bytes")
     values = np.empty(count, dtype)
-    view = memoryview(values.view(np.uint8)) if left > 0 else memoryview(bytearray())
+    view = values.view(np.uint8).data if left > 0 else memoryview(bytearray())
     if entry.compress_type == zipfile.ZIP_STORED:
         _read_stored(stream, entry, view)
     else:
@@ -284,11 +284,11 @@ def load_minari(dataset_id: str, download: bool, trusted: bool = False) -> Any:
     :raises ValueError: If its metadata are out of proportion, or name an environment in place of spaces
     """
     import minari
-    from minari.storage import get_dataset_path
+    from minari.storage import get_dataset_path, hosting
 
     path = get_dataset_path(dataset_id) / "data" / "metadata.json"
     if download and not path.parent.exists():
-        minari.download_dataset(dataset_id)
+        hosting.download_dataset(dataset_id)
     if path.is_file():
         with errors_of(dataset_id):
             metadata = json.loads(path.read_text(encoding="utf-8"))

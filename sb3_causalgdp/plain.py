@@ -29,6 +29,7 @@ SEQUENCES: dict[str, Callable[[list], Any]] = {"tuple": tuple, "set": set, "froz
 ARRAY_KINDS = "biufcSUMm"  # no objects
 FORMAT = 1
 DEEPEST = 60
+LATE = ("_np_random", "_np_random_seed", "low_repr", "high_repr")  # of spaces, made when they are asked for
 LONGEST_NUMBER = 5_000
 
 
@@ -314,7 +315,8 @@ def _check_space(space: Any) -> None:
         raise ValueError(f"the attributes of {cls.__name__} do not fit each other")
     for name, value in vars(fresh).items():
         given = vars(space)[name]
-        is_same = name in ("_np_random", "_np_random_seed") or type(given) is type(value)
+        is_same = name in LATE and isinstance(given, str | int | list | tuple | dict | np.random.Generator | None)
+        is_same = is_same or isinstance(given, type(value))
         if not is_same or (isinstance(value, np.ndarray) and (value.shape, value.dtype) != (given.shape, given.dtype)):
             raise ValueError(f"{name} of {cls.__name__} does not fit its other attributes")
     if not isinstance(space._np_random, np.random.Generator | None):

@@ -485,7 +485,7 @@ class CausalGDPPolicy(BasePolicy):
         :param path: File, or file-like object
         """
         arguments = {**self._get_constructor_parameters(), "lr_schedule": None}
-        written, entries = plain_entries(arguments, known_to_policies())
+        written, entries = plain_entries(arguments, _known_to_policies())
         left = {name: value for name, value in arguments.items() if name not in written}
         saved = {
             "state_dict": self.state_dict(),
@@ -837,7 +837,7 @@ class MultiInputPolicy(CausalGDPPolicy):
 MlpPolicy = CausalGDPPolicy
 
 
-def known_to_policies() -> Known:
+def _known_to_policies() -> Known:
     """
     :return: What a saved policy may name
     """
@@ -856,7 +856,7 @@ def _read_policy(file: BinaryIO, device: th.device, trusted: bool) -> tuple[dict
             raise ValueError(f"it holds pickled objects, which could run code: {TRUST}") from error
     content = saved.get(CONTENT)
     arguments = (
-        {} if content is None else decoded(read_json(content), saved[BLOCK].cpu().numpy().tobytes(), known_to_policies())
+        {} if content is None else decoded(read_json(content), saved[BLOCK].cpu().numpy().tobytes(), _known_to_policies())
     )
     arguments = {**saved["data"], **arguments}
     if not trusted:

@@ -159,16 +159,16 @@ def test_pickled_tensors_are_not_run(hostile, saved, tmp_path):
     stream = io.BytesIO()
     th.save({"log": hostile}, stream)
     path = changed(saved, tmp_path / "strange.zip", policy__pth=stream.getvalue())
-    with pytest.raises(ValueError, match="strange.zip"):
+    with pytest.raises(ValueError, match=r"strange.zip"):
         CausalGDP.load(path, device="cpu")
-    with pytest.raises(ValueError, match="policy.pth is no file of tensors"):
+    with pytest.raises(ValueError, match=r"policy.pth is no file of tensors"):
         CausalGDP.load(changed(saved, path, policy__pth=pickle.dumps(hostile)), device="cpu")
 
 
 def test_schedules_of_your_own_need_trust(tmp_path):
     model = CausalGDP("MlpPolicy", "Pendulum-v1", **TINY, learning_rate=lambda progress: 1e-3 * progress)
     model.save(tmp_path / "model.zip")
-    with pytest.raises(ValueError, match="model.zip cannot be loaded: learning_rate, lr_schedule are pickled"):
+    with pytest.raises(ValueError, match=r"model.zip cannot be loaded: learning_rate, lr_schedule are pickled"):
         CausalGDP.load(tmp_path / "model.zip", device="cpu")
     assert CausalGDP.load(tmp_path / "model.zip", device="cpu", trusted=True).lr_schedule(0.5) == 5e-4
     given = {"learning_rate": 1e-4, "lr_schedule": None}
@@ -176,7 +176,7 @@ def test_schedules_of_your_own_need_trust(tmp_path):
 
 
 def test_a_zip_of_an_older_version_needs_trust():
-    with pytest.raises(ValueError, match="policy_class, .* are pickled"):
+    with pytest.raises(ValueError, match=r"policy_class, .* are pickled"):
         CausalGDP.load(OLD, device="cpu")
     model = CausalGDP.load(OLD, device="cpu", trusted=True)
     assert model.num_timesteps == 230 and model.causal_graph().num_timesteps == 210
@@ -209,7 +209,7 @@ def test_networks_larger_than_the_file_are_refused(saved, tmp_path, units):
         content["attributes"]["policy_kwargs"] = {"dict": [["net_arch", units]]}
         return content
 
-    with pytest.raises(ValueError, match="policy_kwargs.*net_arch"):
+    with pytest.raises(ValueError, match=r"policy_kwargs.*net_arch"):
         CausalGDP.load(changed(saved, tmp_path / "strange.zip", plain__json=wide), device="cpu")
 
 
@@ -246,7 +246,7 @@ def test_zip_bombs_are_refused_before_they_are_unpacked(saved, tmp_path, monkeyp
         lambda: MlpPolicy.load(path),
         lambda: open_source(path.rename(path.with_suffix(".npz"))),
     ):
-        with pytest.raises(ValueError, match="bomb.* times as many|bomb.*compressed"):
+        with pytest.raises(ValueError, match=r"bomb.* times as many|bomb.*compressed"):
             read()
 
 
@@ -254,7 +254,7 @@ def test_damage_that_a_checksum_shows_is_refused(saved, tmp_path):
     data = bytearray(saved.read_bytes())
     data[len(data) // 2] ^= 4
     (tmp_path / "damaged.zip").write_bytes(data)
-    with pytest.raises(ValueError, match="damaged.zip cannot be loaded"):
+    with pytest.raises(ValueError, match=r"damaged.zip cannot be loaded"):
         CausalGDP.load(tmp_path / "damaged.zip", device="cpu")
 
 
@@ -316,7 +316,22 @@ def test_buffers_come_back(model, tmp_path, suffix):
         np.testing.assert_array_equal(getattr(buffer, name), getattr(other, name))
     assert (buffer.pos, buffer.full, buffer.buffer_size) == (other.pos, other.full, other.buffer_size)
     assert open_source(path).n_rows == 230
+    with pytest.warns(UserWarning, match="was saved after 230 steps, the model after 0"):
+        CausalGDP("MlpPolicy", "Pendulum-v1", **TINY).load_replay_buffer(path)
     assert make_preloaded(path).offline_buffer.size() == 230
+
+
+@pytest.mark.parametrize("suffix", [".npz", ".pkl"])
+def test_the_preloaded_part_comes_back(model, tmp_path, suffix):
+    model.save_replay_buffer(tmp_path / "first.npz")
+    both = make_preloaded(tmp_path / "first.npz").learn(40)
+    both.save_replay_buffer(tmp_path / f"both{suffix}")
+    assert open_source(tmp_path / f"both{suffix}").n_rows == 230 + 40
+    assert make_preloaded(tmp_path / f"both{suffix}").offline_buffer.size() == 230 + 40
+    other = CausalGDP("MlpPolicy", "Pendulum-v1", **TINY)
+    other.load_replay_buffer(tmp_path / f"both{suffix}")
+    assert (other.offline_buffer.size(), other.replay_buffer.size()) == (230, 40)
+    assert other._offline_marks == both._offline_marks
 
 
 def make_preloaded(path):
@@ -431,7 +446,7 @@ def test_the_environment_of_a_dataset_is_not_made(tmp_path, monkeypatch):
     del metadata["action_space"]
     path.write_text(json.dumps(metadata))
     for read in (make_preloaded, open_source):
-        with pytest.raises(ValueError, match="strange/data-v0.*lack a space"):
+        with pytest.raises(ValueError, match=r"strange/data-v0.*lack a space"):
             read("strange/data-v0")
     assert not mark.exists()
     # It is not the test that is harmless

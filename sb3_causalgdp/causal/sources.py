@@ -362,6 +362,7 @@ def _open_file(path: Path, max_rows: int | None, trusted: bool) -> TransitionSou
 def _saved_buffer(arrays: dict[str, np.ndarray], prefix: str = "") -> Any:
     """What ``save_replay_buffer`` wrote, with the rows that were stored."""
     own = {name.removeprefix(prefix): values for name, values in arrays.items() if name.startswith(prefix)}
+    own = {name: values for name, values in own.items() if not name.startswith("offline/")}
     content = read_json(own["buffer"].tobytes())
     attributes = decoded(content, own["block"].tobytes(), Known(SPACES), only=BUFFER_ATTRIBUTES)
     missing = [name for name in BUFFER_ATTRIBUTES if name not in (*attributes, *own) and f"{name}/" not in str(list(own))]
@@ -376,6 +377,8 @@ def _saved_buffer(arrays: dict[str, np.ndarray], prefix: str = "") -> Any:
     for name in ("actions", "rewards", "dones"):
         if own[name].shape[:1] < (n_rows,) or own[name].shape[1:2] != (buffer.n_envs,):
             raise ValueError(f"{name} has shape {own[name].shape}, of {n_rows} rows and {buffer.n_envs} environments")
+    if not prefix and "offline/buffer" in arrays:
+        buffer.offline_part = (_saved_buffer(arrays, "offline/"), [])
     return buffer
 
 

@@ -106,21 +106,22 @@ def read_buffer(path: Any, trusted: bool = False) -> ReplayBuffer:
     """
     with errors_of(path, "cannot be read as a replay buffer"), opened(path) as file:
         if is_zip(file):
-            return _from_arrays(read_arrays(file))
+            return _from_arrays(read_arrays(file), named(path))
         buffer = read_pickle(file, trusted)
         if not isinstance(buffer, ReplayBuffer):
             raise ValueError(f"{named(path)} holds no replay buffer of SB3 but a {type(buffer).__name__}")
         if not trusted:
             for one in (buffer, getattr(buffer, "offline_part", (None,))[0]):
                 if one is not None:
-                    check_columns(one)
+                    check_columns(one, named(path))
         return buffer
 
 
-def _from_arrays(arrays: dict[str, np.ndarray]) -> ReplayBuffer:
-    buffer, content = _one_buffer({name: values for name, values in arrays.items() if not name.startswith(OFFLINE)})
+def _from_arrays(arrays: dict[str, np.ndarray], name_of_buffer: str) -> ReplayBuffer:
+    own = {name: values for name, values in arrays.items() if not name.startswith(OFFLINE)}
+    buffer, content = _one_buffer(own, name_of_buffer)
     parts = {name.removeprefix(OFFLINE): values for name, values in arrays.items() if name.startswith(OFFLINE)}
-    offline = buffer if content.get("is_offline") is True else _one_buffer(parts)[0] if parts else None
+    offline = buffer if content.get("is_offline") is True else _one_buffer(parts, name_of_buffer)[0] if parts else None
     marks = content.get("marks")
     if not isinstance(marks, list) or not all(isinstance(mark, str) for mark in marks):
         raise ValueError(f"marks must be names, got {str(marks)[:80]}")
@@ -128,14 +129,18 @@ def _from_arrays(arrays: dict[str, np.ndarray]) -> ReplayBuffer:
     return buffer
 
 
-def _one_buffer(arrays: dict[str, np.ndarray]) -> tuple[ReplayBuffer, dict[str, Any]]:
+def _one_buffer(arrays: dict[str, np.ndarray], name_of_buffer: str) -> tuple[ReplayBuffer, dict[str, Any]]:
     if CONTENT not in arrays or BLOCK not in arrays:
         raise ValueError("it says of no replay buffer what it is")
     content = decoded(read_json(arrays.pop(CONTENT).tobytes()), arrays.pop(BLOCK).tobytes(), KNOWN)
     buffer = _empty(content)
-    vars(buffer).update({name: content[name] for name in vars(buffer) if name in content})
+    # The last is what our algorithm adds
+    names = [name for name in (*vars(buffer), "saved_after") if name in content]
+    if type(content.get("saved_after", 0)) is not int:
+        raise ValueError(f"saved_after must be a number of steps, got {str(content['saved_after'])[:80]}")
+    vars(buffer).update({name: content[name] for name in names})
     _fill(buffer, arrays)
-    check_columns(buffer)
+    check_columns(buffer, name_of_buffer)
     return buffer, content
 
 
@@ -191,9 +196,10 @@ def _fill(buffer: ReplayBuffer, arrays: dict[str, np.ndarray]) -> None:
             setattr(buffer, attribute, values)
 
 
-def check_columns(buffer: ReplayBuffer) -> None:
+def check_columns(buffer: ReplayBuffer, name_of_buffer: str) -> None:
     """
     :param buffer: A replay buffer of one of SB3's classes
+    :param name_of_buffer: What to call it
     :raises ValueError: If its attributes do not fit each other and its spaces, or a stored row is NaN or infinite
     """
     lacks = {"observation_space", "action_space", "n_envs", "buffer_size", "pos", "full"} - vars(buffer).keys()
@@ -212,11 +218,11 @@ def check_columns(buffer: ReplayBuffer) -> None:
         wanted = (buffer.buffer_size, *column.shape[1:])
         there = columns.get(name)
         if there is None or there.shape != wanted or there.dtype != column.dtype:
-            got = "none" if there is None else f"{there.shape} and {there.dtype}"
-            raise ValueError(f"{name} must be of shape {wanted} and {column.dtype}, got {got}")
+            shape, dtype = (None, None) if there is None else (there.shape, there.dtype)
+            raise ValueError(f"its {name} have the shape {shape}, and {wanted} is needed, of {column.dtype}, got {dtype}")
     if not 0 <= buffer.pos < buffer.buffer_size:
-        raise ValueError(f"pos must be from 0 to {buffer.buffer_size - 1}, got {buffer.pos}")
-    _check_finite(columns, _n_rows(buffer))
+        raise ValueError(f"its position is {buffer.pos}, and its size {buffer.buffer_size}")
+    _check_finite(columns, _n_rows(buffer), name_of_buffer)
 
 
 def _small(buffer: ReplayBuffer) -> ReplayBuffer:
@@ -236,11 +242,12 @@ def _small(buffer: ReplayBuffer) -> ReplayBuffer:
     )
 
 
-def _check_finite(columns: Mapping[str, np.ndarray], n_rows: int) -> None:
+def _check_finite(columns: Mapping[str, np.ndarray], n_rows: int, name_of_buffer: str) -> None:
     for name, column in columns.items():
         stored = column[:n_rows]
         # The sum is much faster, and finite where all are
         with np.errstate(over="ignore", invalid="ignore"):
             if column.dtype.kind == "f" and not np.isfinite(stored.sum()) and not np.isfinite(stored).all():
-                where = np.argwhere(~np.isfinite(stored))[0].tolist()
-                raise ValueError(f"{name} is NaN or infinite at {where}")
+                position, column_of, *where = np.argwhere(~np.isfinite(stored))[0].tolist()
+                place = f"{name}{where or ''} at position {position} of environment {column_of}"
+                raise ValueError(f"{name_of_buffer} has a NaN or infinite value in {place}")
