@@ -1122,7 +1122,7 @@ class CausalGDP(OfflineToOnlineAlgorithm):
                 values = {**saved.plain, **given}
                 # SB3 replaces only what its own entry names
                 more = {name: value for name, value in values.items() if name in LARGE and name not in saved.named}
-                return super().load(
+                model = super().load(
                     file,
                     env,
                     device,
@@ -1131,9 +1131,29 @@ class CausalGDP(OfflineToOnlineAlgorithm):
                     force_reset=force_reset,
                     **{**more, **kwargs},
                 )
+                if not trusted:
+                    model._check_loaded()
+                return model
         finally:
             if file is not path:
                 file.close()
+
+    def _check_loaded(self) -> None:
+        """
+        :raises ValueError: If what a file says of the causal structure is something else, or not about this model
+        """
+        if not isinstance(self.causal_graph_history, list):
+            raise ValueError(f"causal_graph_history must be a list, got {type(self.causal_graph_history).__name__}")
+        for graph in (self._causal_graph, *self.causal_graph_history):
+            if graph is not None and getattr(graph, "variables", None) != self.transition_variables:
+                raise ValueError(f"its causal graph is of other variables: {str(graph)[:80]}")
+        statistics = self.causal_statistics
+        fresh = make_statistics(self.discovery, self.transition_variables, self.causal_half_life, self.causal_window)
+        of_same = all(getattr(statistics, name, None) == getattr(fresh, name, None) for name in ("variables", "n_variables"))
+        if type(statistics) is not type(fresh) or not of_same:
+            raise ValueError(
+                f"causal_statistics must be {type(fresh).__name__} of the model's variables, got {str(statistics)[:80]}"
+            )
 
     @classmethod
     def _known_classes(cls) -> Known:

@@ -20,6 +20,7 @@ KNOWN = Known([*SPACES, GoalSelectionStrategy], BUFFERS)
 CONTENT, BLOCK, OFFLINE = "buffer", "block", "offline/"
 NOT_WRITTEN = ("env", "device", "offline_part", "infos")
 MOST_ROWS = 100_000_000
+MOST_GOALS = 1_000
 
 
 # Writing ----------------------------------------------------------------------------------------------------------------
@@ -223,6 +224,23 @@ def check_columns(buffer: ReplayBuffer, name_of_buffer: str) -> None:
     if not 0 <= buffer.pos < buffer.buffer_size:
         raise ValueError(f"its position is {buffer.pos}, and its size {buffer.buffer_size}")
     _check_finite(columns, _n_rows(buffer), name_of_buffer)
+    _check_ranges(buffer, columns)
+
+
+def _check_ranges(buffer: Any, columns: Mapping[str, np.ndarray]) -> None:
+    """What rows and numbers of rows are computed from."""
+    size, n_rows = buffer.buffer_size, _n_rows(buffer)
+    for name, most in {"dones": 1, "timeouts": 1, "ep_start": size - 1, "ep_length": size}.items():
+        rows = columns[name][:n_rows] if name in columns else np.zeros(0)
+        if rows.size > 0 and not 0 <= rows.min() <= rows.max() <= most:
+            raise ValueError(f"its {name} must be from 0 to {most}, got {rows.min()} to {rows.max()}")
+    for name, most in {"n_sampled_goal": MOST_GOALS, "her_ratio": 1, "n_steps": size, "gamma": 1}.items():
+        value = getattr(buffer, name, 0)
+        if not 0 <= value <= most:
+            raise ValueError(f"its {name} must be from 0 to {most}, got {value}")
+    starts = getattr(buffer, "_current_ep_start", np.zeros(1, np.int64))
+    if not 0 <= starts.min() <= starts.max() < size:
+        raise ValueError(f"its episodes must begin at a position from 0 to {size - 1}, got {starts.tolist()}")
 
 
 def _small(buffer: ReplayBuffer) -> ReplayBuffer:
