@@ -321,7 +321,7 @@ def test_the_fraction_can_be_annealed(arrays):
 
 @pytest.mark.parametrize("fraction", [-0.1, 1.5, lambda remaining: 2.0])
 def test_a_fraction_outside_of_0_and_1_is_refused(fraction):
-    with pytest.raises(ValueError, match="offline_fraction must be between 0 and 1"):
+    with pytest.raises(ValueError, match="offline_fraction must be (between|a number from) 0 (and|to) 1"):
         make(offline_fraction=fraction)
 
 
@@ -552,11 +552,11 @@ def test_a_saved_buffer_brings_its_preloaded_part_wherever_it_is_read(has_learne
     n_online = 80 if has_learned else 0
     model.save_replay_buffer(tmp_path / "buffer")
     n_preloaded = model.offline_buffer.size() * 2
-    other = make().preload(tmp_path / "buffer.pkl")
+    other = make().preload(tmp_path / "buffer.npz")
     assert other.offline_buffer.size() == n_preloaded + n_online
     half = n_preloaded // 2
     np.testing.assert_array_equal(other.offline_buffer.actions[:half, 0], model.offline_buffer.actions[:half, 0])
-    source = open_causal_source(tmp_path / "buffer.pkl")
+    source = open_causal_source(tmp_path / "buffer.npz")
     rows = np.concatenate(list(source.batches(7)))
     assert source.n_rows == len(rows) == n_preloaded + n_online
     np.testing.assert_array_equal(np.sort(rows[:, -1]), np.sort(other.offline_buffer.rewards[: len(rows), 0]))

@@ -84,6 +84,8 @@ class Source:
 
     has_scaled_actions = False
     """Whether actions are in [-1, 1] already, as SB3's replay buffers store them."""
+    layout: spaces.Space | None = None
+    """What flat observations were flattened from, with its order of keys; None if it is not known."""
     is_in_order = True
     """Whether a transition that does not end an episode is followed by the next one of that episode."""
 
@@ -172,6 +174,7 @@ class BufferSource(Source):
     has_scaled_actions = True
 
     def __init__(self, buffer: ReplayBuffer, name: str = "The replay buffer") -> None:
+        self.layout = getattr(buffer, "observation_layout", None)
         self.buffers = [part for part in (preloaded_part_of(buffer), buffer) if part is not None]
         if any(part.optimize_memory_usage for part in self.buffers):
             raise ValueError(
