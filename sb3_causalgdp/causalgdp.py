@@ -123,8 +123,8 @@ class CausalGDP(OfflineToOnlineAlgorithm):
     :param actor_update: Which action the Q term of the policy loss judges. ``one_step``: the clean action that the noise
         prediction of the denoising term gives already (EDP, https://arxiv.org/abs/2305.20081), half the cost of an update;
         ``chain``: the end of the whole chain, through which the gradient then flows (Diffusion-QL)
-    :param q_scale: What the Q term is divided by. ``advantage``: by how much the Q of the policy's actions differs from that
-        of the replayed ones, in the mean; ``value``: by the mean absolute Q (Diffusion-QL), which grows with the returns
+    :param q_scale: What the Q term is divided by. ``value``: by the mean absolute Q (Diffusion-QL), which grows with the
+        returns; ``advantage``: by how much the Q of the policy's actions differs from that of the replayed ones, in the mean
     :param bound_penalty: Weight, in the policy loss, of the mean squared distance of clean actions from [-1, 1] before they
         are clipped, so that none goes so far that it finds no way back
     :param policy_delay: The actor is updated once every so many gradient steps, as in TD3. Where a call of :meth:`train` makes
@@ -229,7 +229,7 @@ class CausalGDP(OfflineToOnlineAlgorithm):
         eta: float = 1.0,
         denoising_weight: float = 0.05,
         actor_update: str = "one_step",
-        q_scale: str = "advantage",
+        q_scale: str = "value",
         bound_penalty: float = 0.1,
         policy_delay: int = 2,
         world_model_delay: int = 2,
