@@ -356,7 +356,7 @@ def test_the_fraction_can_be_annealed(arrays):
 
 @pytest.mark.parametrize("fraction", [-0.1, 1.5, lambda remaining: 2.0])
 def test_a_fraction_outside_of_0_and_1_is_refused(fraction):
-    with pytest.raises(ValueError, match="offline_fraction must be (between|a number from) 0 (and|to) 1"):
+    with pytest.raises(ValueError, match=r"offline_fraction must be (between|a number from) 0 (and|to) 1"):
         make(offline_fraction=fraction)
 
 
