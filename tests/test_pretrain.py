@@ -8,7 +8,14 @@ import torch as th
 from goal_env import GoalEnv
 from gymnasium import spaces
 from stable_baselines3 import HerReplayBuffer
-from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback, EvalCallback
+from stable_baselines3.common.callbacks import (
+    BaseCallback,
+    CheckpointCallback,
+    EvalCallback,
+    StopTrainingOnMaxEpisodes,
+    StopTrainingOnNoModelImprovement,
+    StopTrainingOnRewardThreshold,
+)
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecNormalize
 
@@ -172,6 +179,34 @@ def test_it_stops_and_goes_on(model):
     model.pretrain(8, callback=first)
     model.pretrain(5, callback=second)
     assert first.steps == [1, 2, 3] and second.steps == [4, 5, 6, 7, 8]
+
+
+class AsksForSteps(BaseCallback):
+    """Reads what callbacks of the zoo and of SB3 read of each step."""
+
+    def _on_training_start(self):
+        assert not self.locals["dones"].any() and len(self.locals["infos"]) == self.training_env.num_envs
+
+    def _on_step(self):
+        assert self.locals["self"] is self.model and not self.locals["dones"].any()
+        return not any("episode" in info for info in self.locals["infos"])
+
+
+@pytest.mark.parametrize("n_envs", [1, 3])
+def test_callbacks_that_ask_for_the_environments_steps_find_that_no_episode_ended(n_envs, arrays):
+    model = make(make_vec_env("Pendulum-v1", n_envs=n_envs)).preload(arrays)
+    model.pretrain(4, callback=[StopTrainingOnMaxEpisodes(1, verbose=1), AsksForSteps()])
+    assert model.n_pretrain_steps == 4
+
+
+def test_a_model_without_improvement_stops_the_offline_stage(arrays):
+    env = make_vec_env(lambda: gym.wrappers.TimeLimit(gym.make("Pendulum-v1"), 5))
+    stop = StopTrainingOnNoModelImprovement(max_no_improvement_evals=1, min_evals=0)
+    good_enough = StopTrainingOnRewardThreshold(reward_threshold=-1e9)
+    for callbacks in ({"callback_after_eval": stop}, {"callback_on_new_best": good_enough}):
+        model = make(learning_rate=0.0).preload(arrays)
+        model.pretrain(40, callback=EvalCallback(env, eval_freq=2, n_eval_episodes=1, verbose=0, **callbacks))
+        assert model.n_pretrain_steps < 40
 
 
 def test_an_exception_leaves_the_counters_as_they_were(model):

@@ -305,7 +305,8 @@ class OfflineToOnlineAlgorithm(OffPolicyAlgorithm):
         The offline stage: train everything on what was preloaded (or on the replay buffer, if nothing was), without an
         environment. The causal masks come first, and again every ``causal_refresh_freq`` gradient steps.
 
-        Callbacks are called once after each gradient step, and may stop by returning False. While it runs, ``num_timesteps``
+        Callbacks are called once after each gradient step, and may stop by returning False. Of an environment, which is not
+        stepped, their ``locals`` have ``dones``, all False, and empty ``infos``. While it runs, ``num_timesteps``
         is the number of gradient steps of all calls, so that evaluations, checkpoints and logs are numbered by it; afterwards
         it is that of environment steps again. Schedules (learning rates) go from 1 to 0 over the steps of this call; after
         earlier calls they start where ``learn(reset_num_timesteps=False)`` would, so that an interrupted call and one with the
@@ -327,13 +328,15 @@ class OfflineToOnlineAlgorithm(OffPolicyAlgorithm):
             self._logger = configure_logger(self.verbose, self.tensorboard_log, tb_log_name, self._n_pretrain_steps == 0)
         with self._pretraining_clock(gradient_steps) as total_timesteps:
             callback = self._init_callback([*callback_list(callback), *([_GradientStepsBar()] if progress_bar else [])])
-            callback.on_training_start(locals(), globals())
+            # No episode ends here, and there are no infos: callbacks that ask for them find none
+            without_steps = {"dones": np.zeros(self.n_envs, dtype=bool), "infos": [{} for _ in range(self.n_envs)]}
+            callback.on_training_start({**locals(), **without_steps}, globals())
             while self.num_timesteps < total_timesteps:
                 self.train(gradient_steps=1, batch_size=self.batch_size)
                 self.num_timesteps += 1
                 self._n_pretrain_steps += 1
                 self._update_current_progress_remaining(self.num_timesteps, total_timesteps)
-                callback.update_locals(locals())
+                callback.update_locals({**locals(), **without_steps})
                 if not callback.on_step():
                     break
                 if log_interval is not None and self.num_timesteps % log_interval == 0:

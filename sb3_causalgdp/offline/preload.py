@@ -166,7 +166,7 @@ class _Writer:
         if self.map is None:
             self._make_map(shape_of_arrays(chunk.observations))
         assert self.map is not None
-        observations, next_observations = self.map(chunk.observations), self.map(chunk.next_observations)
+        observations, next_observations = self._mapped(chunk.observations), self._mapped(chunk.next_observations)
         actions = self._scaled(chunk)
         dones = chunk.terminations | chunk.truncations
         if self.needs_order and not self.source.is_in_order:
@@ -186,6 +186,16 @@ class _Writer:
             self._count(chunk.rewards[here], dones[here])
             self.n_written += count
             done += count
+
+    def _mapped(self, tree: Any) -> Any:
+        assert self.map is not None
+        try:
+            return self.map(tree)
+        except (KeyError, IndexError, TypeError, ValueError) as error:
+            raise ValueError(
+                f"{self.source.name} does not hold what its observation space announces, in episode {self.episode}: "
+                f"{type(error).__name__}: {error}. Nothing was loaded"
+            ) from error
 
     def _scaled(self, chunk: Chunk) -> np.ndarray:
         """Actions in [-1, 1], as SB3 stores them."""

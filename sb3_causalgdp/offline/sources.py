@@ -17,6 +17,10 @@ from sb3_causalgdp.offline.saved_buffers import SUFFIXES, is_buffer, read_buffer
 
 MINARI_ID = re.compile(r"(\w+://[-\w]+/)?[-\w]+(/[-\w]+)*-v\d+")
 ARRAYS = ("observations", "actions", "rewards", "next_observations", "terminations", "truncations")
+BUFFER_FIELDS = (
+    *("observations", "next_observations", "actions", "rewards", "dones", "timeouts", "pos", "full", "buffer_size", "n_envs"),
+    *("optimize_memory_usage", "observation_space", "action_space"),
+)
 CHUNK_ROWS = 10_000
 
 
@@ -175,6 +179,10 @@ class BufferSource(Source):
 
     def __init__(self, buffer: ReplayBuffer, name: str = "The replay buffer") -> None:
         self.layout = getattr(buffer, "observation_layout", None)
+        dropped = "next_observations" if getattr(buffer, "optimize_memory_usage", False) else None
+        missing = [field for field in BUFFER_FIELDS if field != dropped and not hasattr(buffer, field)]
+        if missing:
+            raise ValueError(f"{name} lacks {missing}: it was not written by this version of SB3's {type(buffer).__name__}")
         self.buffers = [part for part in (preloaded_part_of(buffer), buffer) if part is not None]
         if any(part.optimize_memory_usage for part in self.buffers):
             raise ValueError(

@@ -129,4 +129,4 @@ def test_the_order_travels_with_the_model_and_its_buffer(tmp_path):
     with pytest.raises(ValueError, match=message):
         other.load_replay_buffer(tmp_path / "buffer")
     with pytest.raises(ValueError, match=message):
-        other.preload(tmp_path / "buffer.npz")
+        other.preload(tmp_path / "buffer")
