@@ -26,7 +26,7 @@ from sb3_causalgdp.diffusion.schedules import NOISE_SCHEDULES
 from sb3_causalgdp.offline.rewards import REWARD_TRANSFORMS
 
 ACTOR_UPDATES = ("one_step", "chain")
-Q_SCALES = ("advantage", "value")
+Q_SCALES = ("value", "advantage")
 GUIDANCE_TARGETS = ("return", "reward")
 
 # Rates and weights: their squares, and those of what they scale, stay inside float32

@@ -3,6 +3,7 @@
 import io
 import math
 import pathlib
+import warnings
 from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from copy import deepcopy
@@ -123,8 +124,8 @@ class CausalGDP(OfflineToOnlineAlgorithm):
     :param actor_update: Which action the Q term of the policy loss judges. ``one_step``: the clean action that the noise
         prediction of the denoising term gives already (EDP, https://arxiv.org/abs/2305.20081), half the cost of an update;
         ``chain``: the end of the whole chain, through which the gradient then flows (Diffusion-QL)
-    :param q_scale: What the Q term is divided by. ``advantage``: by how much the Q of the policy's actions differs from that
-        of the replayed ones, in the mean; ``value``: by the mean absolute Q (Diffusion-QL), which grows with the returns
+    :param q_scale: What the Q term is divided by. ``value``: by the mean absolute Q (Diffusion-QL), which grows with the
+        returns; ``advantage``: by how much the Q of the policy's actions differs from that of the replayed ones, in the mean
     :param bound_penalty: Weight, in the policy loss, of the mean squared distance of clean actions from [-1, 1] before they
         are clipped, so that none goes so far that it finds no way back
     :param policy_delay: The actor is updated once every so many gradient steps, as in TD3. Where a call of :meth:`train` makes
@@ -206,6 +207,7 @@ class CausalGDP(OfflineToOnlineAlgorithm):
     N_BACKUP_ACTIONS = 10
     GRAPHS_IN_HISTORY = 32
     MOST_ROWS_PER_DRAW = 16_384
+    MOST_RESTORES = 3
 
     def __init__(
         self,
@@ -229,7 +231,7 @@ class CausalGDP(OfflineToOnlineAlgorithm):
         eta: float = 1.0,
         denoising_weight: float = 0.05,
         actor_update: str = "one_step",
-        q_scale: str = "advantage",
+        q_scale: str = "value",
         bound_penalty: float = 0.1,
         policy_delay: int = 2,
         world_model_delay: int = 2,
@@ -914,14 +916,46 @@ class CausalGDP(OfflineToOnlineAlgorithm):
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
     ) -> SelfCausalGDP:
-        return super().learn(
-            total_timesteps=total_timesteps,
-            callback=callback,
-            log_interval=log_interval,
-            tb_log_name=tb_log_name,
-            reset_num_timesteps=reset_num_timesteps,
-            progress_bar=progress_bar,
-        )
+        n_restores = 0
+        while True:
+            try:
+                return super().learn(
+                    total_timesteps=total_timesteps,
+                    callback=callback,
+                    log_interval=log_interval,
+                    tb_log_name=tb_log_name,
+                    reset_num_timesteps=reset_num_timesteps,
+                    progress_bar=progress_bar,
+                )
+            except TrainingDivergedError as error:
+                if n_restores == self.MOST_RESTORES or not self._restore_checkpoint(callback, error):
+                    raise
+                n_restores += 1
+                total_timesteps, reset_num_timesteps = self.remaining_timesteps, False
+
+    def _restore_checkpoint(self, callback: MaybeCallback, error: TrainingDivergedError) -> bool:
+        """After a divergence, go back to the newest checkpoint of a callback that is told to; whether there is one."""
+        wanted = (one for top in callback_list(callback) for one in all_callbacks(top))
+        folders = [
+            one.folder for one in wanted if isinstance(one, TrainingCheckpointCallback) and one.on_divergence == "restore"
+        ]
+        try:
+            restored = [type(self).resume(folder, self.env, self.device) for folder in folders[:1]]
+        except FileNotFoundError:
+            restored = []
+        if not restored:
+            return False
+        logger = self._logger
+        vars(self).update(vars(restored[0]))
+        self._logger = logger
+        # They were made for the other object
+        self._create_aliases()
+        self._setup_compile()
+        self._setup_cuda_graphs()
+        # The same ones would lead to the same end
+        self.set_random_seed(int(np.random.SeedSequence().generate_state(1)[0] >> 1))
+        warnings.warn(f"{error} It goes on from {folders[0]} after {self.num_timesteps} steps, with other random numbers.")
+        return True
 
     def _setup_learn(
         self,

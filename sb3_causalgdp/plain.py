@@ -304,7 +304,7 @@ def _check_space(space: Any) -> None:
     cls = type(space)
     arguments: dict[type, Callable[[], tuple[Any, ...]]] = {
         spaces.Box: lambda: (space.low, space.high, space.low.shape, space.dtype.type),
-        spaces.Dict: lambda: (dict(space.spaces),),
+        spaces.Dict: lambda: (OrderedDict(space.spaces),),
         spaces.Discrete: lambda: (space.n, None, space.start),
         spaces.MultiBinary: lambda: (space.n,),
         spaces.MultiDiscrete: lambda: (space.nvec, space.dtype.type, None, space.start),

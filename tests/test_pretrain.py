@@ -8,7 +8,14 @@ import torch as th
 from goal_env import GoalEnv
 from gymnasium import spaces
 from stable_baselines3 import HerReplayBuffer
-from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback, EvalCallback
+from stable_baselines3.common.callbacks import (
+    BaseCallback,
+    CheckpointCallback,
+    EvalCallback,
+    StopTrainingOnMaxEpisodes,
+    StopTrainingOnNoModelImprovement,
+    StopTrainingOnRewardThreshold,
+)
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecNormalize
 
@@ -174,6 +181,34 @@ def test_it_stops_and_goes_on(model):
     assert first.steps == [1, 2, 3] and second.steps == [4, 5, 6, 7, 8]
 
 
+class AsksForSteps(BaseCallback):
+    """Reads what callbacks of the zoo and of SB3 read of each step."""
+
+    def _on_training_start(self):
+        assert not self.locals["dones"].any() and len(self.locals["infos"]) == self.training_env.num_envs
+
+    def _on_step(self):
+        assert self.locals["self"] is self.model and not self.locals["dones"].any()
+        return not any("episode" in info for info in self.locals["infos"])
+
+
+@pytest.mark.parametrize("n_envs", [1, 3])
+def test_callbacks_that_ask_for_the_environments_steps_find_that_no_episode_ended(n_envs, arrays):
+    model = make(make_vec_env("Pendulum-v1", n_envs=n_envs)).preload(arrays)
+    model.pretrain(4, callback=[StopTrainingOnMaxEpisodes(1, verbose=1), AsksForSteps()])
+    assert model.n_pretrain_steps == 4
+
+
+def test_a_model_without_improvement_stops_the_offline_stage(arrays):
+    env = make_vec_env(lambda: gym.wrappers.TimeLimit(gym.make("Pendulum-v1"), 5))
+    stop = StopTrainingOnNoModelImprovement(max_no_improvement_evals=1, min_evals=0)
+    good_enough = StopTrainingOnRewardThreshold(reward_threshold=-1e9)
+    for callbacks in ({"callback_after_eval": stop}, {"callback_on_new_best": good_enough}):
+        model = make(learning_rate=0.0).preload(arrays)
+        model.pretrain(40, callback=EvalCallback(env, eval_freq=2, n_eval_episodes=1, verbose=0, **callbacks))
+        assert model.n_pretrain_steps < 40
+
+
 def test_an_exception_leaves_the_counters_as_they_were(model):
     def fail(*_):
         raise KeyboardInterrupt
@@ -321,7 +356,7 @@ def test_the_fraction_can_be_annealed(arrays):
 
 @pytest.mark.parametrize("fraction", [-0.1, 1.5, lambda remaining: 2.0])
 def test_a_fraction_outside_of_0_and_1_is_refused(fraction):
-    with pytest.raises(ValueError, match="offline_fraction must be between 0 and 1"):
+    with pytest.raises(ValueError, match=r"offline_fraction must be (between|a number from) 0 (and|to) 1"):
         make(offline_fraction=fraction)
 
 
@@ -552,11 +587,11 @@ def test_a_saved_buffer_brings_its_preloaded_part_wherever_it_is_read(has_learne
     n_online = 80 if has_learned else 0
     model.save_replay_buffer(tmp_path / "buffer")
     n_preloaded = model.offline_buffer.size() * 2
-    other = make().preload(tmp_path / "buffer.pkl")
+    other = make().preload(tmp_path / "buffer.npz")
     assert other.offline_buffer.size() == n_preloaded + n_online
     half = n_preloaded // 2
     np.testing.assert_array_equal(other.offline_buffer.actions[:half, 0], model.offline_buffer.actions[:half, 0])
-    source = open_causal_source(tmp_path / "buffer.pkl")
+    source = open_causal_source(tmp_path / "buffer.npz")
     rows = np.concatenate(list(source.batches(7)))
     assert source.n_rows == len(rows) == n_preloaded + n_online
     np.testing.assert_array_equal(np.sort(rows[:, -1]), np.sort(other.offline_buffer.rewards[: len(rows), 0]))

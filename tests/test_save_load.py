@@ -213,7 +213,7 @@ ARGUMENTS = {
     "eta": 0.5,
     "denoising_weight": 0.7,
     "actor_update": "chain",
-    "q_scale": "value",
+    "q_scale": "advantage",
     "bound_penalty": 0.2,
     "policy_delay": 3,
     "world_model_delay": 4,

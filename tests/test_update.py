@@ -165,7 +165,7 @@ def test_the_next_critic_sets_the_scale_and_a_single_one_its_own(n_critics, clim
 
 
 def test_one_step_judges_the_clean_estimate_of_the_denoising_term():
-    model = trained_model(actor_update="one_step", q_scale="value")
+    model = trained_model(actor_update="one_step")
     data = model.replay_buffer.sample(64)
     q_term, clean = q_term_and_its_noise(model, data)
     first, second = q_values(
@@ -179,7 +179,7 @@ def test_one_step_judges_the_clean_estimate_of_the_denoising_term():
 
 
 def test_the_chain_judges_where_the_chain_ends():
-    model = trained_model(actor_update="chain", q_scale="value")
+    model = trained_model(actor_update="chain")
     data = model.replay_buffer.sample(64)
     q_term, clean = q_term_and_its_noise(model, data)
     one_step = -q_values(model.critic, data.observations.float(), clean)[0].mean()

@@ -114,7 +114,8 @@ def seconds_to(curves: Curves, level: float) -> list[float]:
 def table(results: Mapping[str, Curves], against: str | None = None, level: float | None = None) -> str:
     """A table in Markdown of the last evaluations."""
     header = ["", "seeds", "mean +- sd", "interquartile mean", "CPU seconds", "each seed"]
-    header += [f"better than {against}"] * (against is not None) + [f"CPU seconds to {level:g}"] * (level is not None)  # type: ignore[str-format]
+    header += [] if against is None else [f"better than {against}"]
+    header += [] if level is None else [f"CPU seconds to {level:g}"]
     rows = [header, ["---"] * len(header)]
     for name, curves in results.items():
         last = curves.returns[:, -1]

@@ -237,7 +237,6 @@ def study_arguments(task: str) -> dict[str, Any]:
         "learning_rate": ACTOR_LEARNING_RATE,
         "critic_learning_rate": CRITIC_LEARNING_RATE,
         "denoising_weight": 1.0,
-        "q_scale": "value",
         # Updates are what is counted: each one trains all parts, as the peers' do
         "policy_delay": 1,
         "world_model_delay": 1,

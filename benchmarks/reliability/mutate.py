@@ -29,7 +29,7 @@ from typing import Any
 
 SECONDS = 30.0
 KINDS = ("model.zip", "policy.pt", "buffer.npz", "buffer.pkl", "her.npz", "arrays.npz", "minari", "graph.json")
-WILD = (
+WILD: tuple[Any, ...] = (
     *(None, True, False, [], {}, "", "x", "nan", "../../etc/passwd", "os:system", -1, 0, 1, 2, 3.5, 1e9, -1e9, 1e308),
     *(10**6, 10**9, 10**18, -(10**18), 10**400, float("nan"), float("inf"), "a" * 10_000, [[]] * 50, {"class": "os.system"}),
 )

@@ -77,8 +77,8 @@ def parse_kwargs(items: Sequence[str]) -> dict[str, Any]:
         if item.lstrip().startswith("{"):
             try:
                 kwargs.update(json.loads(item))
-            except json.JSONDecodeError as error:
-                raise ValueError(f"--method-kwargs: {item!r} is no JSON object: {error}") from error
+            except (ValueError, RecursionError) as error:
+                raise ValueError(f"--method-kwargs: {item[:80]!r} is no JSON object: {error}") from error
         else:
             key, equals, value = item.partition("=")
             if not (equals and key.isidentifier()):
@@ -91,7 +91,7 @@ def _value_of(text: str) -> Any:
     for parse in (json.loads, ast.literal_eval):
         try:
             return parse(text)
-        except (ValueError, SyntaxError):
+        except (ValueError, SyntaxError, RecursionError, MemoryError):  # what their parsers raise on too many brackets
             continue
     return text
 

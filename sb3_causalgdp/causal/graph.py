@@ -338,7 +338,7 @@ class CausalGraph:
         """
         try:
             content = json.loads(text)
-        except json.JSONDecodeError as error:
+        except (ValueError, RecursionError) as error:  # a number can have too many digits, lists too many brackets
             raise ValueError(f"text is not JSON: {error}") from error
         if not isinstance(content, dict):
             raise ValueError(f"text is not a causal graph: it holds a {type(content).__name__}, not an object")
@@ -350,7 +350,7 @@ class CausalGraph:
         try:
             content["variables"] = TransitionVariables(**content["variables"])
             return cls(**content)
-        except (TypeError, ValueError) as error:
+        except (TypeError, ValueError, OverflowError) as error:
             raise ValueError(f"text is not a causal graph: {error}") from error
 
     def save(self, path: str | os.PathLike[str]) -> None:
@@ -409,7 +409,7 @@ def _checked(name: str, values: Any, shape: tuple[int, ...]) -> np.ndarray:
     """The values as a new float64 array of this shape, all finite."""
     try:
         values = np.array(values, dtype=np.float64)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise ValueError(f"{name} must be numbers of shape {shape}: {error}") from error
     if values.shape != shape:
         raise ValueError(f"{name} must have shape {shape}, got {values.shape}")

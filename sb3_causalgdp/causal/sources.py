@@ -148,14 +148,27 @@ class TransitionSource(ABC):
 
     def _chosen_rows(self, n_rows: int) -> Iterator[np.ndarray]:
         if self.n_rows == self.n_stored:
-            yield from self._parts(n_rows)
+            yield from self._read_parts(n_rows)
             return
         chosen = np.linspace(0, self.n_stored - 1, self.n_rows).astype(np.int64)
         first = 0
-        for part in self._parts(n_rows):
+        for part in self._read_parts(n_rows):
             lower, upper = np.searchsorted(chosen, [first, first + len(part)])
             yield part[chosen[lower:upper] - first]
             first += len(part)
+
+    def _read_parts(self, n_rows: int) -> Iterator[np.ndarray]:
+        n_read = 0
+        try:
+            for part in self._parts(n_rows):
+                n_read += len(part)
+                yield part
+        except SourceError:
+            raise
+        except Exception as error:  # of the file's library, or of parts that do not fit together
+            raise SourceError(f"{self.name} is incomplete or damaged behind transition {n_read}: {one_line(error)}") from error
+        if n_read != self.n_stored:
+            raise SourceError(f"{self.name} is incomplete: it announces {self.n_stored} transitions and holds {n_read}")
 
     @abstractmethod
     def _parts(self, n_rows: int) -> Iterator[np.ndarray]:
@@ -336,6 +349,9 @@ def open_source(
             raise
         except ValueError as error:
             raise SourceError(str(error)) from error
+        except (AttributeError, IndexError, KeyError, TypeError) as error:
+            # Something with the attributes of a buffer need not be one
+            raise SourceError(f"{path} is incomplete or damaged: {one_line(error)}") from error
     if path.suffix in SUFFIXES or not MINARI_ID.fullmatch(name):
         raise SourceError(f"no file {name!r}, and the id of a Minari dataset ends in -v and a number")
     return _open_minari(name, download, max_rows, trusted)

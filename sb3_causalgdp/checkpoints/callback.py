@@ -11,6 +11,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_causalgdp.checkpoints.checkpoint import begin_training, check_folder, save_checkpoint
 
+ON_DIVERGENCE = ("raise", "restore")
 TERMINATED = 143
 """Exit status of a process that ended because it was asked to, by SIGTERM."""
 
@@ -28,6 +29,8 @@ class TrainingCheckpointCallback(BaseCallback):
     :param every: Environment steps from one checkpoint to the next, in ``pretrain()`` gradient steps
     :param keep: How many of the newest checkpoints to keep, None for all; transitions are shared by all
     :param at_end: Whether to write one at the end of the training, too, so that more steps can follow
+    :param on_divergence: What ``CausalGDP.learn()`` does when the training diverges: ``raise`` the error, or ``restore`` the
+        newest checkpoint and go on with other random numbers, three times at most
     :param handle_sigterm: Whether to write a checkpoint on SIGTERM
     :param verbose: Verbosity level: 1 prints each checkpoint
     :raises ValueError: If ``every`` or ``keep`` is below 1, and when the training starts, if the folder is another training's
@@ -42,6 +45,7 @@ class TrainingCheckpointCallback(BaseCallback):
         every: int = 10_000,
         keep: int | None = 2,
         at_end: bool = True,
+        on_divergence: str = "raise",
         handle_sigterm: bool = True,
         verbose: int = 0,
     ) -> None:
@@ -49,10 +53,13 @@ class TrainingCheckpointCallback(BaseCallback):
         for name, value in {"every": every, "keep": 1 if keep is None else keep}.items():
             if value < 1:
                 raise ValueError(f"{name} must be at least 1, got {value!r}")
+        if on_divergence not in ON_DIVERGENCE:
+            raise ValueError(f"on_divergence must be one of {list(ON_DIVERGENCE)}, got {on_divergence!r}")
         self.folder = Path(folder)
         self.every = every
         self.keep = keep
         self.at_end = at_end
+        self.on_divergence = on_divergence
         self.handle_sigterm = handle_sigterm
         self._handler_before: Any = None
         self._was_asked_to_stop = False
@@ -62,6 +69,7 @@ class TrainingCheckpointCallback(BaseCallback):
         begin_training(self._algorithm, self._top)
         check_folder(self._algorithm, self.folder)
         self._saved_at = self.num_timesteps
+        self._restore_handler()
         if self.handle_sigterm and threading.current_thread() is threading.main_thread():
             self._handler_before = signal.signal(signal.SIGTERM, self._ask_to_stop)
 

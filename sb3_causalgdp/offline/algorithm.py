@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from typing import Any, TypeVar
 
 import numpy as np
+from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback, ProgressBarCallback
 from stable_baselines3.common.noise import ActionNoise, VectorizedActionNoise
@@ -23,7 +24,7 @@ from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 from sb3_causalgdp.archives import errors_of, existing
 from sb3_causalgdp.files import saved_when_done
 from sb3_causalgdp.offline.loaded_buffers import check_loaded_buffer, in_columns
-from sb3_causalgdp.offline.observations import flat_space
+from sb3_causalgdp.offline.observations import flat_space, flattened_space, layout_name, same_layout
 from sb3_causalgdp.offline.preload import (
     check_buffer,
     copy_rows,
@@ -87,6 +88,8 @@ class OfflineToOnlineAlgorithm(OffPolicyAlgorithm):
         self._env_steps_before_pretrain: int | None = None
         # Which parts of the observations were normalised when the networks were trained last, None before they were
         self._trained_normalised: list[str] | None = None
+        # The space of dictionaries or tuples that observations are flattened from: its order of keys is theirs
+        self.observation_layout: spaces.Space | None = None
         # A buffer of hindsight replay that is known to hold a whole episode: to look for one takes as long as to sample
         self._buffer_with_episode: ReplayBuffer | None = None
 
@@ -105,6 +108,7 @@ class OfflineToOnlineAlgorithm(OffPolicyAlgorithm):
             self.num_timesteps, self._env_steps_before_pretrain = self._env_steps_before_pretrain, None
         if self.env is not None:
             self._check_normalisation(self._vec_normalize_env)
+            self.observation_layout = self._checked_layout(self.env)
         super()._setup_model()
         if self.offline_dataset is not None:
             assert self.replay_buffer is not None
@@ -129,11 +133,12 @@ class OfflineToOnlineAlgorithm(OffPolicyAlgorithm):
         :return: The model
         """
         observation_space, action_space = spaces_of(open_source(source))
+        layout = observation_space
         policy_class = cls.policy_aliases.get(policy) if isinstance(policy, str) else policy
         if not (policy_class is not None and issubclass(policy_class, cls.policy_aliases["MultiInputPolicy"])):
-            observation_space = flat_space(observation_space)
+            layout, observation_space = observation_space, flat_space(observation_space)
         model = cls(policy, SpacesEnv(observation_space, action_space, n_envs), **kwargs)
-        model.env = None
+        model.env, model.observation_layout = None, layout if layout is not observation_space else None
         return model
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
@@ -146,11 +151,45 @@ class OfflineToOnlineAlgorithm(OffPolicyAlgorithm):
         """
         normalizer = unwrap_vec_normalize(env) if isinstance(env, VecEnv) else None
         self._check_normalisation(normalizer)
+        layout = self._checked_layout(env)
         if normalizer is not None and self.offline_buffer is not None and self._reward_transform is not None:
             check_buffer(self.offline_buffer, self._reward_transform, normalizer)
         super().set_env(env, force_reset)
+        self.observation_layout = layout
         if normalizer is not None and self.offline_buffer is not None:
             prime_normalizer(normalizer, self.offline_buffer, (0, self.offline_buffer.size()), self._offline_marks)
+
+    def _checked_layout(self, env: GymEnv) -> spaces.Space | None:
+        """What the observations of an environment are flattened from, by key; the model's own where that cannot be told."""
+        own = self.observation_layout
+        found = flattened_space(env, own)
+        if same_layout(own, found):
+            if own is not None and found is None and not isinstance(env, SpacesEnv):
+                warnings.warn(
+                    f"The model's observations are flattened in the order {layout_name(own)}, and it is not known whether "
+                    "those of this environment are"
+                )
+            return own if found is None else found
+        assert own is not None and found is not None
+        raise ValueError(
+            f"The model's observations are flattened in the order {layout_name(own)}, and this environment's in the order "
+            f"{layout_name(found)}: give the environment that order of keys, or make the model with this environment"
+        )
+
+    def _layout_of(self, given: spaces.Space) -> spaces.Space | None:
+        if self.observation_layout is None:
+            self.observation_layout = flattened_space(self.env, given)
+        return self.observation_layout
+
+    def _check_layout(self, layout: spaces.Space | None, name: str) -> None:
+        own = self.observation_layout
+        if not same_layout(own, layout):
+            assert own is not None and layout is not None
+            raise ValueError(
+                f"{name} holds observations flattened in the order {layout_name(layout)}, and the model's are in the order "
+                f"{layout_name(own)}"
+            )
+        self.observation_layout = own or layout
 
     def _check_normalisation(self, normalizer: VecNormalize | None) -> None:
         before, now = self._trained_normalised, normalised_parts(normalizer)
@@ -199,7 +238,8 @@ class OfflineToOnlineAlgorithm(OffPolicyAlgorithm):
         with errors_of(data.name, "cannot be loaded"):
             buffer = self._buffer_with_room(data)
         transform = name if self._reward_transform is None else self._reward_transform
-        done = preload_buffer(buffer, data, self.env, self._vec_normalize_env, transform, progress_bar)
+        self._check_layout(data.layout, data.name)
+        done = preload_buffer(buffer, data, self.env, self._vec_normalize_env, transform, progress_bar, self._layout_of)
         if self.replay_buffer is self.offline_buffer or self._replay_buffer_is_empty():
             self.replay_buffer = buffer
         self.offline_buffer = buffer
@@ -265,7 +305,8 @@ class OfflineToOnlineAlgorithm(OffPolicyAlgorithm):
         The offline stage: train everything on what was preloaded (or on the replay buffer, if nothing was), without an
         environment. The causal masks come first, and again every ``causal_refresh_freq`` gradient steps.
 
-        Callbacks are called once after each gradient step, and may stop by returning False. While it runs, ``num_timesteps``
+        Callbacks are called once after each gradient step, and may stop by returning False. Of an environment, which is not
+        stepped, their ``locals`` have ``dones``, all False, and empty ``infos``. While it runs, ``num_timesteps``
         is the number of gradient steps of all calls, so that evaluations, checkpoints and logs are numbered by it; afterwards
         it is that of environment steps again. Schedules (learning rates) go from 1 to 0 over the steps of this call; after
         earlier calls they start where ``learn(reset_num_timesteps=False)`` would, so that an interrupted call and one with the
@@ -287,13 +328,15 @@ class OfflineToOnlineAlgorithm(OffPolicyAlgorithm):
             self._logger = configure_logger(self.verbose, self.tensorboard_log, tb_log_name, self._n_pretrain_steps == 0)
         with self._pretraining_clock(gradient_steps) as total_timesteps:
             callback = self._init_callback([*callback_list(callback), *([_GradientStepsBar()] if progress_bar else [])])
-            callback.on_training_start(locals(), globals())
+            # No episode ends here, and there are no infos: callbacks that ask for them find none
+            without_steps = {"dones": np.zeros(self.n_envs, dtype=bool), "infos": [{} for _ in range(self.n_envs)]}
+            callback.on_training_start({**locals(), **without_steps}, globals())
             while self.num_timesteps < total_timesteps:
                 self.train(gradient_steps=1, batch_size=self.batch_size)
                 self.num_timesteps += 1
                 self._n_pretrain_steps += 1
                 self._update_current_progress_remaining(self.num_timesteps, total_timesteps)
-                callback.update_locals(locals())
+                callback.update_locals({**locals(), **without_steps})
                 if not callback.on_step():
                     break
                 if log_interval is not None and self.num_timesteps % log_interval == 0:
@@ -415,7 +458,8 @@ class OfflineToOnlineAlgorithm(OffPolicyAlgorithm):
             pickled = True
             warnings.warn(f"{type(self.replay_buffer).__name__} is pickled: load_replay_buffer needs trusted=True to read it")
         self.replay_buffer.offline_part = (self.offline_buffer, self._offline_marks)  # type: ignore[attr-defined]
-        self.replay_buffer.saved_after = self.n_environment_steps  # type: ignore[attr-defined]
+        more = {"saved_after": self.n_environment_steps, "observation_layout": self.observation_layout}
+        vars(self.replay_buffer).update(more)
         try:
             with saved_when_done(path, ".pkl" if pickled else ".npz") as file:
                 if pickled:
@@ -423,8 +467,8 @@ class OfflineToOnlineAlgorithm(OffPolicyAlgorithm):
                 else:
                     write_buffer(self.replay_buffer, file)
         finally:
-            del self.replay_buffer.offline_part  # type: ignore[attr-defined]
-            del self.replay_buffer.saved_after  # type: ignore[attr-defined]
+            for name in ("offline_part", *more):
+                del vars(self.replay_buffer)[name]
 
     def load_replay_buffer(
         self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True, *, trusted: bool = False
@@ -448,6 +492,7 @@ class OfflineToOnlineAlgorithm(OffPolicyAlgorithm):
     def _use_loaded_buffer(self, buffer: ReplayBuffer, name: str, truncate_last_traj: bool) -> None:
         """All or nothing."""
         offline, marks = vars(buffer).pop("offline_part", (None, []))
+        self._check_layout(vars(buffer).pop("observation_layout", None), name)
         saved_after = vars(buffer).pop("saved_after", self.num_timesteps)
         for one in {id(one): one for one in (buffer, offline) if one is not None}.values():
             if isinstance(one, HerReplayBuffer):

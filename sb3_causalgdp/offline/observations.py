@@ -1,36 +1,147 @@
 """From a dataset's observations to a model's: the same flattening and the same image layout as its environment's wrappers."""
 
+import re
 from collections.abc import Callable, Mapping
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
+from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 ObservationMap = Callable[[Any], Any]
+Path = tuple[str | int, ...]
 
 
-def flattened_space(env: VecEnv | None) -> spaces.Space | None:
+def flattened_space(env: gym.Env | VecEnv | None, parts: spaces.Space | None = None) -> spaces.Space | None:
     """
     :param env: A model's environment
-    :return: The space that a ``FlattenObservation`` wrapper of it flattens, with the environment's own order of keys; None if
-        there is no such wrapper, or it lives in another process
+    :param parts: A space with the parts that it may flatten, in any order, by which one in another process is asked
+    :return: The space that its ``FlattenObservation`` wrapper flattens, with the environment's own order of keys; None if
+        there is no such wrapper, or it cannot be asked
     """
-    base = None if env is None else env.unwrapped
-    one = base.envs[0] if isinstance(base, DummyVecEnv) else None
-    while isinstance(one, gym.Wrapper):
-        if isinstance(one, gym.wrappers.FlattenObservation):
-            return one.env.observation_space
-        one = one.env
+    if not isinstance(env, VecEnv):
+        return _wrapped_space(env)
+    base = env.unwrapped
+    if isinstance(base, DummyVecEnv):
+        return _wrapped_space(base.envs[0])
+    if parts is None or not _can_be_asked(base):
+        return None
+    return _layout_by_asking(base, parts)
+
+
+def _wrapped_space(env: gym.Env | None) -> spaces.Space | None:
+    while isinstance(env, gym.Wrapper):
+        if isinstance(env, gym.wrappers.FlattenObservation):
+            return env.env.observation_space
+        env = env.env
     return None
 
 
-def observation_map(given: spaces.Space, wanted: spaces.Space, env: VecEnv | None, name: str) -> ObservationMap:
+def _can_be_asked(base: VecEnv) -> bool:
+    """Whether the outermost wrapper that has a method ``observation`` is ``FlattenObservation``."""
+    if not base.env_is_wrapped(gym.wrappers.FlattenObservation, indices=[0])[0]:
+        return False
+    for name in re.findall(r"<(\w+)", base.env_method("__str__", indices=[0])[0]):
+        if name == "FlattenObservation":
+            return True
+        wrapper = Monitor if name == "Monitor" else getattr(gym.wrappers, name, None)
+        if wrapper is None or hasattr(wrapper, "observation"):
+            return False
+    return False
+
+
+class _Probe(dict):
+    """An observation; parts that it does not have are one zero."""
+
+    def __missing__(self, key: Any) -> "_Probe":
+        return _Probe()
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
+        return np.zeros(1, dtype)
+
+
+def _layout_by_asking(base: VecEnv, parts: spaces.Space) -> spaces.Space | None:
+    """Where the flattened observation changes when one part does."""
+
+    def flattened(changed: Path | None) -> np.ndarray:
+        return np.asarray(base.env_method("observation", _probe(parts, changed), indices=[0])[0])
+
+    plain, first_of = flattened(None), {}
+    for path, _ in leaves_of_space(parts):
+        moved = np.flatnonzero(flattened(path) != plain)
+        if len(moved) > 0:
+            first_of[path] = int(moved[0])
+    layout = _in_order(parts, first_of)
+    return layout if layout is not None and spaces.flatdim(layout) == len(plain) else None
+
+
+def _probe(space: spaces.Space, changed: Path | None, path: Path = ()) -> Any:
+    if isinstance(space, spaces.Dict):
+        return _Probe({key: _probe(part, changed, (*path, key)) for key, part in space.spaces.items()})
+    if isinstance(space, spaces.Tuple):
+        return tuple(_probe(part, changed, (*path, index)) for index, part in enumerate(space.spaces))
+    step = int(path == changed)
+    if isinstance(space, spaces.Discrete):
+        return space.start + min(step, space.n - 1)
+    if isinstance(space, spaces.MultiDiscrete):
+        return space.start + np.minimum(step, space.nvec - 1)
+    assert space.shape is not None
+    return np.full(space.shape, step, space.dtype)
+
+
+def _in_order(space: spaces.Space, first_of: dict[Path, int], path: Path = ()) -> spaces.Space | None:
+    """The space with its keys in the order of these positions, and without parts that have none."""
+    if isinstance(space, spaces.Dict):
+        below = {key: [at for found, at in first_of.items() if found[: len(path) + 1] == (*path, key)] for key in space.spaces}
+        keys = sorted((key for key, positions in below.items() if positions), key=lambda key: min(below[key]))
+        parts = [(key, _in_order(space[key], first_of, (*path, key))) for key in keys]
+        return spaces.Dict([(key, part) for key, part in parts if part is not None]) if parts else None
+    return space
+
+
+def leaves_of_space(space: spaces.Space, path: Path = ()) -> list[tuple[Path, int]]:
+    """
+    :param space: A space, may be nested
+    :return: The keys that lead to each part, and its flattened size, in the order of the space: its layout
+    """
+    if isinstance(space, spaces.Dict | spaces.Tuple):
+        named = space.spaces.items() if isinstance(space, spaces.Dict) else enumerate(space.spaces)
+        return [leaf for key, part in named for leaf in leaves_of_space(part, (*path, key))]  # type: ignore[misc]
+    return [(path, spaces.flatdim(space))]
+
+
+def layout_name(space: spaces.Space) -> str:
+    """
+    :param space: A space that is flattened
+    :return: Its parts by name, in their order
+    """
+    return "[" + ", ".join(".".join(map(str, path)) for path, _ in leaves_of_space(space)) + "]"
+
+
+def same_layout(space: spaces.Space | None, other: spaces.Space | None) -> bool:
+    """
+    :param space: A space that is flattened, None if it is not known
+    :param other: Another
+    :return: Whether they have the same parts in the same order, or one is not known
+    """
+    return space is None or other is None or leaves_of_space(space) == leaves_of_space(other)
+
+
+def _has_an_order(space: spaces.Space) -> bool:
+    """Whether there are keys that can be in another order."""
+    if isinstance(space, spaces.Dict | spaces.Tuple):
+        parts = space.spaces.values() if isinstance(space, spaces.Dict) else space.spaces
+        return (isinstance(space, spaces.Dict) and len(space.spaces) > 1) or any(map(_has_an_order, parts))
+    return False
+
+
+def observation_map(given: spaces.Space, wanted: spaces.Space, layout: spaces.Space | None, name: str) -> ObservationMap:
     """
     :param given: A dataset's observation space
     :param wanted: The model's
-    :param env: The model's environment, which knows what it flattens
+    :param layout: What the model's environment flattens, with its order of keys; None if it is not known
     :param name: What to call the dataset
     :return: A function from batches of the dataset's observations to batches of the model's
     :raises ValueError: If they do not fit
@@ -40,7 +151,13 @@ def observation_map(given: spaces.Space, wanted: spaces.Space, env: VecEnv | Non
         maps = {key: _leaf_map(given[key], part, f"{name}, observations[{key!r}]") for key, part in wanted.items()}
         return lambda tree: {key: one(tree[key]) for key, one in maps.items()}
     if isinstance(wanted, spaces.Box) and isinstance(given, spaces.Dict | spaces.Tuple):
-        layout = flattened_space(env) or given
+        if layout is None and _has_an_order(given) and wanted.shape == (spaces.flatdim(given),):
+            raise ValueError(
+                f"{name} has the parts {layout_name(given)}, and it is not known in which order the environment flattens "
+                "them: use gymnasium's FlattenObservation, the outermost but for wrappers that leave observations alone, or a "
+                "MultiInputPolicy"
+            )
+        layout = layout or given
         _check_parts(layout, given, name)
         if wanted.shape == (spaces.flatdim(layout),):
             return lambda tree: flatten_batch(layout, tree)

@@ -1,7 +1,7 @@
 """Offline transitions into a replay buffer of SB3: checked, whole arrays at a time, all of them or none."""
 
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
@@ -76,6 +76,7 @@ def preload_buffer(
     normalizer: VecNormalize | None = None,
     reward_transform: str | RewardTransform = "none",
     progress_bar: bool = False,
+    layout_of: Callable[[spaces.Space], spaces.Space | None] = lambda given: None,
 ) -> Preloaded:
     """
     Append the source's transitions to a buffer that has room for them. When it raises, the buffer holds what it held.
@@ -89,12 +90,14 @@ def preload_buffer(
     :param normalizer: The model's ``VecNormalize``, whose statistics get these rows if it is training
     :param reward_transform: A name of :data:`~sb3_causalgdp.offline.rewards.REWARD_TRANSFORMS`, or the one to go on with
     :param progress_bar: Whether to show a progress bar
+    :param layout_of: Gives what the model's observations are flattened from, with its order of keys, for the source's space;
+        None where it is not known
     :return: What was loaded
     :raises ValueError: If the source does not fit, or a transition is NaN or infinite
     """
     check_buffer(buffer, reward_transform, normalizer)
     _check_environment(source, env)
-    writer = _Writer(buffer, source, env)
+    writer = _Writer(buffer, source, layout_of)
     with _progress(source, progress_bar) as advance:
         for chunk in source.chunks():
             writer.write(chunk)
@@ -117,15 +120,15 @@ def preload_buffer(
 class _Writer:
     """Writes chunks into the positions behind the buffer's last row, which nobody reads before the buffer is advanced."""
 
-    def __init__(self, buffer: ReplayBuffer, source: Source, env: VecEnv | None) -> None:
+    def __init__(self, buffer: ReplayBuffer, source: Source, layout_of: Callable[[spaces.Space], spaces.Space | None]) -> None:
         self.buffer, self.source = buffer, source
         self.first, self.n_positions = buffer.size(), _n_positions(buffer, source)
         assert self.first + self.n_positions <= buffer.buffer_size
-        self.env = env
+        self.layout_of = layout_of
         self.needs_order = buffer.optimize_memory_usage or isinstance(buffer, NStepReplayBuffer | HerReplayBuffer)
         self.map: ObservationMap | None = None
         if source.observation_space is not None:
-            self.map = observation_map(source.observation_space, buffer.observation_space, env, source.name)
+            self._make_map(source.observation_space)
         assert isinstance(buffer.action_space, spaces.Box)
         self.low, self.high = buffer.action_space.low.ravel(), buffer.action_space.high.ravel()
         self._check_action_space()
@@ -133,6 +136,11 @@ class _Writer:
         self.episode_return, self.returns = 0.0, [np.inf, -np.inf]
         self._expected: np.ndarray | None = None
         self._last_done = True
+
+    def _make_map(self, given: spaces.Space) -> None:
+        flattens = isinstance(self.buffer.observation_space, spaces.Box) and isinstance(given, spaces.Dict | spaces.Tuple)
+        layout = self.layout_of(given) if flattens else None
+        self.map = observation_map(given, self.buffer.observation_space, layout, self.source.name)
 
     @property
     def return_range(self) -> tuple[float, float]:
@@ -156,9 +164,9 @@ class _Writer:
                 f"{self.source.name} holds more than the {self.source.n_transitions} transitions that it announces"
             )
         if self.map is None:
-            given = shape_of_arrays(chunk.observations)
-            self.map = observation_map(given, self.buffer.observation_space, self.env, self.source.name)
-        observations, next_observations = self.map(chunk.observations), self.map(chunk.next_observations)
+            self._make_map(shape_of_arrays(chunk.observations))
+        assert self.map is not None
+        observations, next_observations = self._mapped(chunk.observations), self._mapped(chunk.next_observations)
         actions = self._scaled(chunk)
         dones = chunk.terminations | chunk.truncations
         if self.needs_order and not self.source.is_in_order:
@@ -178,6 +186,16 @@ class _Writer:
             self._count(chunk.rewards[here], dones[here])
             self.n_written += count
             done += count
+
+    def _mapped(self, tree: Any) -> Any:
+        assert self.map is not None
+        try:
+            return self.map(tree)
+        except (KeyError, IndexError, TypeError, ValueError) as error:
+            raise ValueError(
+                f"{self.source.name} does not hold what its observation space announces, in episode {self.episode}: "
+                f"{type(error).__name__}: {error}. Nothing was loaded"
+            ) from error
 
     def _scaled(self, chunk: Chunk) -> np.ndarray:
         """Actions in [-1, 1], as SB3 stores them."""

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from gymnasium import spaces
 from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.her.goal_selection_strategy import GoalSelectionStrategy
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
@@ -136,9 +137,11 @@ def _one_buffer(arrays: dict[str, np.ndarray], name_of_buffer: str) -> tuple[Rep
     content = decoded(read_json(arrays.pop(CONTENT).tobytes()), arrays.pop(BLOCK).tobytes(), KNOWN)
     buffer = _empty(content)
     # The last is what our algorithm adds
-    names = [name for name in (*vars(buffer), "saved_after") if name in content]
+    names = [name for name in (*vars(buffer), "saved_after", "observation_layout") if name in content]
     if type(content.get("saved_after", 0)) is not int:
         raise ValueError(f"saved_after must be a number of steps, got {str(content['saved_after'])[:80]}")
+    if not isinstance(content.get("observation_layout"), spaces.Space | None):
+        raise ValueError(f"observation_layout must be a space, got {str(content['observation_layout'])[:80]}")
     vars(buffer).update({name: content[name] for name in names})
     _fill(buffer, arrays)
     check_columns(buffer, name_of_buffer)

@@ -17,6 +17,10 @@ from sb3_causalgdp.offline.saved_buffers import SUFFIXES, is_buffer, read_buffer
 
 MINARI_ID = re.compile(r"(\w+://[-\w]+/)?[-\w]+(/[-\w]+)*-v\d+")
 ARRAYS = ("observations", "actions", "rewards", "next_observations", "terminations", "truncations")
+BUFFER_FIELDS = (
+    *("observations", "next_observations", "actions", "rewards", "dones", "timeouts", "pos", "full", "buffer_size", "n_envs"),
+    *("optimize_memory_usage", "observation_space", "action_space"),
+)
 CHUNK_ROWS = 10_000
 
 
@@ -84,6 +88,8 @@ class Source:
 
     has_scaled_actions = False
     """Whether actions are in [-1, 1] already, as SB3's replay buffers store them."""
+    layout: spaces.Space | None = None
+    """What flat observations were flattened from, with its order of keys; None if it is not known."""
     is_in_order = True
     """Whether a transition that does not end an episode is followed by the next one of that episode."""
 
@@ -172,6 +178,11 @@ class BufferSource(Source):
     has_scaled_actions = True
 
     def __init__(self, buffer: ReplayBuffer, name: str = "The replay buffer") -> None:
+        self.layout = getattr(buffer, "observation_layout", None)
+        dropped = "next_observations" if getattr(buffer, "optimize_memory_usage", False) else None
+        missing = [field for field in BUFFER_FIELDS if field != dropped and not hasattr(buffer, field)]
+        if missing:
+            raise ValueError(f"{name} lacks {missing}: it was not written by this version of SB3's {type(buffer).__name__}")
         self.buffers = [part for part in (preloaded_part_of(buffer), buffer) if part is not None]
         if any(part.optimize_memory_usage for part in self.buffers):
             raise ValueError(

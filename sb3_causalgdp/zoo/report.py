@@ -84,13 +84,13 @@ def write_report(
     :param device: Device of the model
     :raises SetupError: If the run has no model of this algorithm
     """
-    kind, model_path = _choose_model(run, load_best)
+    candidates = _models_to_try(run, load_best)
     environment, problem = _make_environment(run, seed)
     try:
-        model = _load_model(model_path, environment, device, run.trusted)
+        kind, model_path, model = _load_first_whole(run, candidates, environment, device)
         played = Played()
         if environment is not None:
-            _play(model, environment, episodes, played)
+            problem = _play(model, environment, episodes, played)
         sections = make_sections(run, model, kind, model_path, played, problem)
     finally:
         if environment is not None:
@@ -110,7 +110,8 @@ def write_report(
 # The model and what it does ---------------------------------------------------------------------------------------------
 
 
-def _choose_model(run: RunFolder, load_best: bool) -> tuple[str, Path]:
+def _models_to_try(run: RunFolder, load_best: bool) -> list[tuple[str, Path]]:
+    """The model that the page is to show, and behind it the others, the newest first."""
     algorithm = run.arguments.get("algo", ALGORITHM)
     if algorithm != ALGORITHM:
         raise SetupError(f"{run.path} is a run of {algorithm}, the page is about {ALGORITHM}: plot_train plots its returns")
@@ -122,17 +123,32 @@ def _choose_model(run: RunFolder, load_best: bool) -> tuple[str, Path]:
             f"{run.path}: there is no model yet. Wait for the end of the training, or train with --save-freq or --eval-freq"
         )
     kind = "best" if load_best else next(iter(models))
-    return kind, models[kind]
+    others = {path: other for other, path in models.items() if other != kind}
+    others |= {path: "checkpoint" for _, path in run.checkpoints() if path != models[kind]}
+    newest_first = sorted(others, key=lambda path: path.stat().st_mtime, reverse=True)
+    return [(kind, models[kind]), *((others[path], path) for path in newest_first)]
+
+
+def _load_first_whole(
+    run: RunFolder, candidates: Sequence[tuple[str, Path]], environment: VecEnv | None, device: str
+) -> tuple[str, Path, CausalGDP]:
+    first_error: Exception | None = None
+    for kind, path in candidates:
+        try:
+            return kind, path, _load_model(path, environment, device, run.trusted)
+        except Exception as error:  # a damaged file can raise anything
+            run.note(path.name, error)
+            first_error = first_error or error
+    raise SetupError(
+        f"{candidates[0][1]} cannot be loaded: {type(first_error).__name__}: {first_error}. There is no other model that can"
+    ) from first_error
 
 
 def _load_model(path: Path, environment: VecEnv | None, device: str, trusted: bool) -> CausalGDP:
-    try:
-        # The plain buffer of one transition needs no environment, HER's does
-        return WithoutReplayBuffer.load(
-            path, environment, device, trusted=trusted, replay_buffer_class=None, replay_buffer_kwargs={}
-        )
-    except Exception as error:
-        raise SetupError(f"{path} cannot be loaded: {type(error).__name__}: {error}") from error
+    # The plain buffer of one transition needs no environment, HER's does
+    return WithoutReplayBuffer.load(
+        path, environment, device, trusted=trusted, replay_buffer_class=None, replay_buffer_kwargs={}
+    )
 
 
 def _make_environment(run: RunFolder, seed: int) -> tuple[VecEnv | None, str | None]:
@@ -164,7 +180,8 @@ def _made_environment(run: RunFolder, seed: int) -> tuple[VecEnv | None, str | N
     return environment, None
 
 
-def _play(model: CausalGDP, environment: VecEnv, episodes: int, played: Played) -> None:
+def _play(model: CausalGDP, environment: VecEnv, episodes: int, played: Played) -> str | None:
+    """Gives what was in the way, None if nothing was."""
     normalizer = unwrap_vec_normalize(environment)
 
     def keep(local: dict[str, Any], _: dict[str, Any]) -> None:
@@ -173,5 +190,9 @@ def _play(model: CausalGDP, environment: VecEnv, episodes: int, played: Played) 
         played.actions.append(local["actions"])
 
     if episodes > 0:
-        returns, lengths = evaluate_policy(model, environment, episodes, callback=keep, return_episode_rewards=True)
+        try:
+            returns, lengths = evaluate_policy(model, environment, episodes, callback=keep, return_episode_rewards=True)
+        except Exception as error:  # whatever an environment raises, the rest of the page can be written
+            return f"{type(error).__name__}: {error}"
         played.returns, played.lengths = list(returns), list(lengths)  # type: ignore[arg-type]
+    return None

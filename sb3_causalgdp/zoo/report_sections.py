@@ -2,7 +2,7 @@
 
 import base64
 import io
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -116,25 +116,36 @@ def make_sections(
     """
     transitions = _transitions(run, model, played)
     return [
-        _summary_section(run, model, kind, model_path),
-        _learning_section(run),
-        _graph_section(model),
-        _history_section(run, model),
-        _effects_section(model, transitions),
-        _guidance_section(model, transitions),
-        _evaluation_section(played, problem),
-        _hyperparameter_section(run, model_path),
-        _version_section(run, model_path),
-        _command_section(run),
+        _guarded("Summary", _summary_section, run, model, kind, model_path),
+        _guarded("Learning curve", _learning_section, run),
+        _guarded("Causal graph", _graph_section, model),
+        _guarded("History of the graph", _history_section, run, model),
+        _guarded("Effects of the actions", _effects_section, run, model, transitions),
+        _guarded("Guidance along the denoising chain", _guidance_section, run, model, transitions),
+        _guarded("Evaluation", _evaluation_section, played, problem),
+        _guarded("Hyperparameters", _hyperparameter_section, run, model_path),
+        _guarded("Versions", _version_section, run, model_path),
+        _guarded("Command", _command_section, run),
     ]
+
+
+def _guarded(title: str, make: Callable[..., Section], *args: Any) -> Section:
+    """The section, or why there is none: one that fails must not take the others with it."""
+    try:
+        return make(*args)
+    except Exception as error:
+        return Section(title, [f"Cannot be shown: {type(error).__name__}: {error}"])
 
 
 def _transitions(run: RunFolder, model: CausalGDP, played: Played) -> Transitions | None:
     path = existing(run.path / "replay_buffer", SUFFIXES)
-    buffer = read_buffer(path, run.trusted) if path.is_file() else None
-    if buffer is not None and buffer.size() > 0:
-        observations, actions = draw_transitions(buffer, model.policy, OBSERVATIONS)
-        return Transitions(observations, actions, f"{len(actions):,} transitions drawn from {path.name}")
+    try:
+        buffer = read_buffer(path, run.trusted) if path.is_file() else None
+        if buffer is not None and buffer.size() > 0:
+            observations, actions = draw_transitions(buffer, model.policy, OBSERVATIONS)
+            return Transitions(observations, actions, f"{len(actions):,} transitions drawn from {path.name}")
+    except Exception as error:  # a damaged file can raise anything
+        run.note(path.name, error)
     if not played.actions:
         return None
     chosen = np.linspace(0, len(played.actions) - 1, min(OBSERVATIONS, len(played.actions))).astype(int)
@@ -171,7 +182,7 @@ def _summary_section(run: RunFolder, model: CausalGDP, kind: str, model_path: Pa
     if model._causal_graph is not None:
         graph = model.causal_graph()
         rows.append(("Causal graph", f"{_n_edges(graph)} edges with a mask above 0.5, from {graph.n_samples:,} transitions"))
-    return Section("Summary", tables=[Table((), rows)])
+    return Section("Summary", run.problems_with(".zip"), tables=[Table((), rows)])
 
 
 def _learning_section(run: RunFolder) -> Section:
@@ -181,6 +192,8 @@ def _learning_section(run: RunFolder) -> Section:
         remarks.append("No training episode has ended, or the monitor files are missing.")
     if evaluations is None:
         remarks.append("The policy was not evaluated while it trained (--eval-freq).")
+    offline = run.evaluations("offline")
+    remarks += run.problems_with("monitor.csv", "evaluations.npz")
     if episodes is not None or evaluations is not None:
         figure = Figure(figsize=(8.0, 4.0), layout="constrained")
         axes = figure.add_subplot()
@@ -190,7 +203,6 @@ def _learning_section(run: RunFolder) -> Section:
             _draw_evaluations(axes, evaluations)
         _finish_curve(axes, "environment steps")
         pictures.append(_picture(figure, "Returns of the training episodes, with exploration noise, and of the evaluations."))
-    offline = run.evaluations("offline")
     if offline is not None:
         figure = Figure(figsize=(8.0, 3.2), layout="constrained")
         axes = figure.add_subplot()
@@ -274,26 +286,34 @@ def _history_section(run: RunFolder, model: CausalGDP) -> Section:
     if len(graphs) < 2:
         known = "one graph is known" if graphs else "no graph is known"
         return Section(
-            title, [f"There is none: {known}. The model at the end of a training holds them, and so do checkpoints."]
+            title,
+            [
+                f"There is none: {known}. The model at the end of a training holds them, and so do checkpoints.",
+                *run.problems_with(".zip"),
+            ],
         )
     first, last = graphs[0], graphs[-1]
     caption = "Masks over the training, with the signs of the effects; number of edges, and how much the masks changed."
     return Section(
         title,
-        [f"{len(graphs)} graphs, from {source}. Below the picture: what changed from {_moment(first)} to {_moment(last)}."],
+        [
+            f"{len(graphs)} graphs, from {source}. Below the picture: what changed from {_moment(first)} to {_moment(last)}.",
+            *run.problems_with(".zip"),
+        ],
         [_picture(plot_history(graphs), caption)],
         [str(last.diff(first))],
     )
 
 
-def _effects_section(model: CausalGDP, transitions: Transitions | None) -> Section:
+def _effects_section(run: RunFolder, model: CausalGDP, transitions: Transitions | None) -> Section:
     title = "Effects of the actions"
+    problems = run.problems_with("replay_buffer.npz", "replay_buffer.pkl")
     if transitions is None:
-        return Section(title, [NO_TRANSITIONS])
+        return Section(title, [NO_TRANSITIONS, *problems])
     try:
         effects = model.effect_of_actions(transitions.observations, transitions.actions)
     except (RuntimeError, ValueError) as error:
-        return Section(title, [f"Not computed: {error}."])
+        return Section(title, [f"Not computed: {error}.", *problems])
     standardised = effects.standardised()
     rows = [
         (name, *(_strength(part.mean[i], part.standard_error[i]) for part in (standardised.reward, effects.reward)))
@@ -303,16 +323,17 @@ def _effects_section(model: CausalGDP, transitions: Transitions | None) -> Secti
     caption = "What the causal world model says that the actions do to the reward, and to the next state, one step ahead."
     return Section(
         title,
-        [f"From {transitions.source}."],
+        [f"From {transitions.source}.", *problems],
         [_picture(effects.plot(), caption)],
         tables=[Table(header, rows, "The numbers, ± one standard error", folded=True)],
     )
 
 
-def _guidance_section(model: CausalGDP, transitions: Transitions | None) -> Section:
+def _guidance_section(run: RunFolder, model: CausalGDP, transitions: Transitions | None) -> Section:
     title = "Guidance along the denoising chain"
+    problems = run.problems_with("replay_buffer.npz", "replay_buffer.pkl")
     if transitions is None:
-        return Section(title, [NO_TRANSITIONS])
+        return Section(title, [NO_TRANSITIONS, *problems])
     if not model.policy.is_guided:
         off = model.policy.guidance_rule is None
         reason = "guidance is off" if off else "there is no causal graph, or guidance_scale is 0"
@@ -321,12 +342,14 @@ def _guidance_section(model: CausalGDP, transitions: Transitions | None) -> Sect
     observations = policy_input(model, _some(transitions.observations, GUIDANCE_OBSERVATIONS))
     figure = plot_guidance_strength(step_divergences(model.policy, observations).cpu())
     caption = "How far the guidance moves each step of the chain; the sum over the steps is TensorBoard's guidance/kl."
-    return Section(title, [f"From {transitions.source}."], [_picture(figure, caption)])
+    return Section(title, [f"From {transitions.source}.", *problems], [_picture(figure, caption)])
 
 
 def _evaluation_section(played: Played, problem: str | None) -> Section:
     title = "Evaluation"
     if not played.returns:
+        # A sentence of an exception may end by itself
+        problem = None if problem is None else problem.rstrip(".")
         return Section(title, [f"Not played: {problem}." if problem else "Not played: --episodes is 0."])
     numbers = range(1, len(played.returns) + 1)
     episodes = zip(numbers, played.returns, played.lengths, strict=True)
@@ -338,12 +361,12 @@ def _evaluation_section(played: Played, problem: str | None) -> Section:
 
 def _hyperparameter_section(run: RunFolder, model_path: Path) -> Section:
     title = "Hyperparameters"
-    remarks, tables = [], []
+    remarks, tables = run.problems_with("config.yml", "args.yml"), []
     rows: list[tuple[str, ...]]
     if run.entry is None:
         remarks.append("The run has no config.yml: what follows is read from the model.")
     else:
-        rows = [(str(key), _text(value)) for key, value in sorted(run.entry.items())]
+        rows = [(str(key), _text(value)) for key, value in sorted(run.entry.items(), key=str)]
         tables.append(Table(("config.yml", ""), rows, "The entry of the YAML file, with what the command line's -params set:"))
     saved = saved_attributes(model_path, run.trusted)
     rows = []
@@ -353,15 +376,18 @@ def _hyperparameter_section(run: RunFolder, model_path: Path) -> Section:
         rows.append((name, value, "" if value == default else default or "(required)"))
     tables.append(Table(("argument", "value", "default, where it differs"), rows, "All arguments of the model", folded=True))
     if run.arguments:
-        rows = [(key, _text(value)) for key, value in sorted(run.arguments.items()) if value not in (None, "", [], False)]
+        rows = [
+            (key, _text(value)) for key, value in sorted(run.arguments.items(), key=str) if value not in (None, "", [], False)
+        ]
         tables.append(Table(("args.yml", ""), rows, "Arguments of the command line", folded=True))
     return Section(title, remarks, tables=tables)
 
 
 def _version_section(run: RunFolder, model_path: Path) -> Section:
     then, now = {**saved_versions(model_path), **run.versions}, installed_versions()
+    remarks = run.problems_with("versions.yml")
     rows = [(name, str(then.get(name, "not recorded")), now.get(name, "")) for name in {**then, **now}]
-    return Section("Versions", tables=[Table(("", "where it was trained", "where this page was written"), rows)])
+    return Section("Versions", remarks, tables=[Table(("", "where it was trained", "where this page was written"), rows)])
 
 
 def _command_section(run: RunFolder) -> Section:

@@ -3,19 +3,18 @@
 import json
 import re
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from stable_baselines3.common.monitor import LoadMonitorResultsError, load_results
-from stable_baselines3.common.results_plotter import X_TIMESTEPS, ts2xy
-
+import pandas as pd
+from stable_baselines3.common.monitor import get_monitor_files
 from stable_baselines3.common.save_util import json_to_data
 
 from sb3_causalgdp import CausalGDP
-from sb3_causalgdp.archives import checked_entries, errors_of, opened, read_arrays, size_of
+from sb3_causalgdp.archives import checked_entries, errors_of, one_line, opened, read_arrays, size_of
 from sb3_causalgdp.causal import CausalGraph
 from sb3_causalgdp.plain import read_json
 from sb3_causalgdp.saved import LARGE, is_pickled, read_plain
@@ -52,18 +51,20 @@ class Evaluations:
 
 class RunFolder:
     """
-    The folder of a run, such as ``logs/causalgdp/Pendulum-v1_1``. Its files are read when they are asked for.
+    The folder of a run, such as ``logs/causalgdp/Pendulum-v1_1``. Its files are read when they are asked for; those that are
+    empty, cut off or damaged, or that need to be trusted and are not, count as missing, and ``problems`` says so.
 
     Nothing that they bring is run, unless they are trusted.
 
     :param path: The folder
     :param trusted: Whether its files may bring Python objects that could run code
-    :raises ValueError: If its settings cannot be read
     """
 
     def __init__(self, path: Path, trusted: bool = False) -> None:
         self.path = path
         self.trusted = trusted
+        self.problems: dict[str, str] = {}
+        """What is wrong with files, by their names."""
         found = sorted(path.glob("*/config.yml")) or sorted(path.glob("*/args.yml"))
         self.settings_path = found[0].parent if found else None
         self.arguments: Mapping[str, Any] = self._settings("args.yml") or {}
@@ -71,12 +72,35 @@ class RunFolder:
 
     def _settings(self, name: str) -> Mapping[str, Any] | None:
         path = None if self.settings_path is None else self.settings_path / name
-        settings = None if path is None or not path.is_file() else read_settings(path, self.trusted)
-        return settings if isinstance(settings, Mapping) else None
+        if path is None or not path.is_file():
+            return None
+        try:
+            settings = read_settings(path, self.trusted)
+        except Exception as error:  # of the parser, or of what the file asks to be made
+            self.note(name, error)
+            return None
+        if not isinstance(settings, Mapping):
+            self.problems[name] = f"{name} is empty or damaged: it holds no settings"
+            return None
+        return settings
 
     def _text(self, name: str) -> str | None:
         path = None if self.settings_path is None else self.settings_path / name
-        return path.read_text(encoding="utf-8") if path is not None and path.is_file() else None
+        return path.read_text(encoding="utf-8", errors="replace") if path is not None and path.is_file() else None
+
+    def note(self, name: str, error: Exception) -> None:
+        """
+        :param name: A file of the run
+        :param error: What its reader raised
+        """
+        self.problems[name] = f"{name} is left out, because it is empty, cut off, damaged or not trusted: {one_line(error)}"
+
+    def problems_with(self, *endings: str) -> list[str]:
+        """
+        :param endings: How the names of files end
+        :return: What is wrong with these
+        """
+        return [problem for name, problem in self.problems.items() if name.endswith(endings)]
 
     @property
     def environment_id(self) -> str | None:
@@ -117,7 +141,7 @@ class RunFolder:
         :return: The causal graphs that the model at the end of the training holds, oldest first; empty without that model
         """
         final = self.models().get("final")
-        return [] if final is None else saved_attributes(final, self.trusted).get("causal_graph_history", [])
+        return [] if final is None else self._attributes(final).get("causal_graph_history", [])
 
     def checkpoint_graphs(self) -> list[CausalGraph]:
         """
@@ -125,10 +149,17 @@ class RunFolder:
         """
         graphs: dict[int, CausalGraph] = {}
         for _, path in self.checkpoints():
-            graph = saved_attributes(path, self.trusted).get("_causal_graph")
+            graph = self._attributes(path).get("_causal_graph")
             if graph is not None and graph.num_timesteps is not None:
                 graphs[graph.num_timesteps] = graph
         return [graphs[steps] for steps in sorted(graphs)]
+
+    def _attributes(self, path: Path) -> dict[str, Any]:
+        try:
+            return saved_attributes(path, self.trusted)
+        except Exception as error:  # a damaged file can raise anything
+            self.note(path.name, error)
+            return {}
 
     # Curves ---------------------------------------------------------------------------------------------------------------
 
@@ -136,11 +167,32 @@ class RunFolder:
         """
         :return: The episodes of the training, None if none ended
         """
-        try:
-            episodes = load_results(str(self.path))
-        except LoadMonitorResultsError:
+        parts = list(self._monitored())
+        if not parts:
             return None
-        return None if len(episodes) == 0 else Episodes(*ts2xy(episodes, X_TIMESTEPS), episodes["t"].to_numpy())
+        episodes = pd.concat(parts).sort_values("t")
+        seconds = episodes["t"].to_numpy() - min(part.attrs["t_start"] for part in parts)
+        return Episodes(episodes["l"].cumsum().to_numpy(), episodes["r"].to_numpy(), seconds)
+
+    def _monitored(self) -> Iterator[pd.DataFrame]:
+        """What each monitor file that can be read holds, with the clock's time of each episode, as SB3's ``load_results``."""
+        for name in get_monitor_files(str(self.path)):
+            path = Path(name)
+            try:
+                with path.open(encoding="utf-8") as file:
+                    started = float(json.loads(file.readline().removeprefix("#"))["t_start"])
+                    given = pd.read_csv(file, usecols=["r", "l", "t"])
+            except Exception as error:  # a damaged file can raise anything
+                self.note(path.name, error)
+                continue
+            episodes = given.apply(pd.to_numeric, errors="coerce").replace([np.inf, -np.inf], np.nan).dropna()
+            if len(episodes) < len(given):
+                n_bad = len(given) - len(episodes)
+                self.problems[path.name] = f"{path.name} is cut off or damaged: {n_bad} of {len(given)} rows are left out"
+            if len(episodes) > 0:
+                episodes["t"] += started
+                episodes.attrs["t_start"] = started
+                yield episodes
 
     def evaluations(self, folder: str = ".") -> Evaluations | None:
         """
@@ -150,9 +202,15 @@ class RunFolder:
         path = self.path / folder / "evaluations.npz"
         if not path.is_file():
             return None
-        with errors_of(path, "cannot be read as evaluations"):
+        try:
             arrays = read_arrays(path, ("timesteps", "results"))
-            return Evaluations(arrays["timesteps"], arrays["results"])
+            steps, returns = np.asarray(arrays["timesteps"], float), np.asarray(arrays["results"], float)
+            if not (steps.ndim == 1 and returns.ndim == 2 and len(steps) == len(returns) and returns.size > 0):
+                raise ValueError(f"evaluations of shapes {steps.shape} and {returns.shape}")
+            return Evaluations(steps.astype(np.int64), returns)
+        except Exception as error:  # a damaged file can raise anything
+            self.note(path.relative_to(self.path).as_posix(), error)
+            return None
 
 
 def saved_attributes(path: Path, trusted: bool = False) -> dict[str, Any]:

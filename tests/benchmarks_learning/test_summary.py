@@ -55,5 +55,6 @@ def test_the_table_and_the_figure_show_every_algorithm(tmp_path):
     results = summary.read(tmp_path, "Env-v5")
     text = summary.table(results, against="peer", level=10.0)
     assert "| own | 3 | 13 +- 1 |" in text and "1 [1, 1]" in text
+    assert "CPU seconds to" not in summary.table(results) and "better" not in summary.table(results)
     summary.draw("Env-v5", results, tmp_path / "figure.png")
     assert (tmp_path / "figure.png").stat().st_size > 10_000

@@ -353,6 +353,8 @@ def test_mistakes_in_the_arguments(arrays, capsys):
         (["--method-kwargs", "max_memory=much"], "--method-kwargs: "),
         (["--method-kwargs", "threshold"], "--method-kwargs must be key=value or a JSON object, got 'threshold'"),
         (["--method-kwargs", "{threshold}"], "'{threshold}' is no JSON object"),
+        (["--method-kwargs", '{"threshold": ' + "[" * 100_000], "is no JSON object"),
+        (["--method-kwargs", "threshold=" + "[" * 100_000], "--method-kwargs: "),
         (["--window", "0"], "--window: must be an integer of at least 1, got '0'"),
         (["--window", "3"], "window must be None or at least 8 rows"),
         (["--max-rows", "many"], "--max-rows: must be an integer"),
@@ -383,6 +385,67 @@ def test_mistakes_in_the_source(tmp_path, capsys):
         ("half.npz", "half.npz lacks the arrays ['next_observations', 'rewards']"),
     ):
         assert message in error_of(capsys, tmp_path / name)
+
+
+def test_minari_datasets_that_are_damaged(minari, capsys):
+    h5py = pytest.importorskip("h5py")
+    for number, field in enumerate(("observations/arm/angle", "observations/goal", "rewards", "actions")):
+        name = f"tests/nested-v{number}"
+        dataset, _ = record(minari, name, NestedEnv(), 2)
+        with h5py.File(Path(dataset.storage.data_path) / "main_data.hdf5", "r+") as file:
+            del file["episode_1"][field]
+        said = error_of(capsys, name, "--quiet")
+        assert (
+            f"{name} is incomplete or damaged behind transition" in said
+            or f"{name} cannot be read, its file is damaged" in said
+        )
+        assert error_of(capsys, name, "--quiet", "--max-rows", "5").count("\n") == 0
+
+
+def test_a_minari_dataset_with_fewer_rows_than_it_announces(minari):
+    dataset, _ = record(minari, "tests/nested-v0", NestedEnv(), 2)
+    dataset = dataset.filter_episodes(lambda episode: episode.id == 0)
+    source = MinariSource(dataset)
+    source.n_stored = source.n_rows = 20
+    with pytest.raises(SourceError, match="it announces 20 transitions and holds 9"):
+        rows_of(source)
+
+
+def test_buffers_that_are_damaged(tmp_path, capsys):
+    def half(buffer):
+        buffer.rewards = buffer.rewards[:2]
+
+    def without_key(buffer):
+        del buffer.observations["desired_goal"]
+
+    def without_space(buffer):
+        buffer.observation_space = None
+
+    def with_nonsense_beside(buffer):
+        buffer.offline_part = 3
+
+    def without_positions(buffer):
+        buffer.pos = "7"
+
+    for damage in (half, without_key, without_space, with_nonsense_beside, without_positions):
+        buffer = DictReplayBuffer(20, GOALS, spaces.Box(-1, 1, (1,)))
+        fill(buffer, 12)
+        damage(buffer)
+        save_to_pkl(tmp_path / "buffer.pkl", buffer)
+        said = error_of(capsys, tmp_path / "buffer.pkl", "--quiet")
+        assert "damaged" in said or "cannot be flattened" in said
+
+
+def test_arrays_that_are_damaged(tmp_path, capsys):
+    np.savez_compressed(tmp_path / "rows.npz", **make_rows(600))
+    whole = (tmp_path / "rows.npz").read_bytes()
+    for position in range(100, len(whole), len(whole) // 40):
+        (tmp_path / "rows.npz").write_bytes(whole[:position] + bytes([whole[position] ^ 0xFF]) + whole[position + 1 :])
+        try:
+            main([str(tmp_path / "rows.npz"), "--quiet"])
+        except SystemExit as stopped:
+            assert stopped.code == 2
+    capsys.readouterr()
 
 
 @pytest.mark.parametrize(

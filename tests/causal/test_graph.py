@@ -257,7 +257,13 @@ def test_other_variables_cannot_be_compared(compare):
 
 @pytest.mark.parametrize(
     ("text", "message"),
-    [("{", "not JSON"), ("[]", "holds a list, not an object"), (json.dumps({"a": 1}), r"unknown fields \['a'\]")],
+    [
+        ("{", "not JSON"),
+        ("[" * 100_000, "not JSON"),
+        ('{"n_samples": ' + "9" * 10_000 + "}", "not JSON"),
+        ("[]", "holds a list, not an object"),
+        (json.dumps({"a": 1}), r"unknown fields \['a'\]"),
+    ],
 )
 def test_bad_json_is_an_error(text, message):
     with pytest.raises(ValueError, match=message):
@@ -290,6 +296,8 @@ def test_json_without_a_field_says_which(missing):
         ("num_timesteps", [1]),
         ("constant_variables", 1),
         ("duplicated_variables", [[["x"]]]),
+        ("masks", [[10**400] * 3] * 3),
+        ("r_squared", [10**400] * 3),
     ],
 )
 def test_malformed_json_fields_are_value_errors(field, value):

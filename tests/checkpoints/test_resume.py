@@ -7,9 +7,10 @@ import pytest
 import torch as th
 from setups import SETUPS, STEPS, Setup, write_dataset
 from small_models import SMALL
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 
-from sb3_causalgdp import CausalGDP, TrainingCheckpointCallback
+from sb3_causalgdp import CausalGDP, TrainingCheckpointCallback, TrainingDivergedError
 from sb3_causalgdp.checkpoints import resume
 from sb3_causalgdp.checkpoints.checkpoint import save_checkpoint
 
@@ -193,6 +194,45 @@ def test_a_model_and_a_buffer_of_other_steps_are_not_of_one_moment(tmp_path):
         loaded.load_replay_buffer(tmp_path / "buffer.pkl")
 
 
+class Diverge(BaseCallback):
+    """Makes the critics infinite at these steps, each time that they come."""
+
+    def __init__(self, *steps, once=True):
+        super().__init__()
+        self.steps, self.once = set(steps), once
+
+    def _on_step(self):
+        if self.num_timesteps in self.steps:
+            self.steps -= {self.num_timesteps} if self.once else set()
+            next(self.model.critic.parameters()).data.fill_(float("inf"))
+        return True
+
+
+def test_a_training_that_diverged_goes_on_from_its_checkpoint_where_that_is_wished(tmp_path):
+    model = Setup().make_model()
+    saving = TrainingCheckpointCallback(tmp_path / "restored", every=50, on_divergence="restore")
+    with pytest.warns(
+        UserWarning, match=r"diverged: .* It goes on from .*restored after 1\d\d steps, with other random numbers"
+    ):
+        model.learn(300, [Diverge(180), saving])
+    assert model.num_timesteps == 304 and CausalGDP.resume(tmp_path / "restored").num_timesteps == 304
+    assert all(th.isfinite(value).all() for value in model.policy.state_dict().values())
+    model.save(tmp_path / "model")
+    # Once more each time: it gives up
+    with pytest.raises(TrainingDivergedError), pytest.warns(UserWarning, match="It goes on from"):
+        Setup().make_model().learn(
+            300,
+            [Diverge(180, once=False), TrainingCheckpointCallback(tmp_path / "hopeless", every=50, on_divergence="restore")],
+        )
+    # By default, and where there is no checkpoint yet, the error is raised at once
+    for callback in (
+        TrainingCheckpointCallback(tmp_path / "raised", every=50),
+        TrainingCheckpointCallback(tmp_path / "too_early", on_divergence="restore"),
+    ):
+        with pytest.raises(TrainingDivergedError):
+            Setup().make_model().learn(300, [Diverge(180), callback])
+
+
 # What is wrong ------------------------------------------------------------------------------------------------------------
 
 
@@ -237,7 +277,7 @@ def test_a_folder_is_for_one_training(folder):
         model.save_checkpoint(folder)
 
 
-@pytest.mark.parametrize("arguments", [{"every": 0}, {"keep": 0}])
+@pytest.mark.parametrize("arguments", [{"every": 0}, {"keep": 0}, {"on_divergence": "ignore"}])
 def test_the_callback_refuses_what_is_out_of_range(tmp_path, arguments):
     with pytest.raises(ValueError, match=next(iter(arguments))):
         TrainingCheckpointCallback(tmp_path, **arguments)

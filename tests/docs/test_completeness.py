@@ -205,6 +205,12 @@ def react_to_images():
     model.counterfactual((observations, np.zeros((1, *env.action_space.shape)), [0.0]), {"action[0]": 0.0}, follow_policy=True)
 
 
+def normalise_a_raw_policy():
+    model = make()
+    model.learn(20)
+    model.set_env(VecNormalize(DummyVecEnv([lambda: gym.make("Pendulum-v1")])))
+
+
 def write_a_foreign_graph():
     make().set_causal_graph(CausalGraph.fully_connected(TransitionVariables(("x",), ("u",))))
 
@@ -228,6 +234,7 @@ ERRORS = {
     "gamma must be a number from 0 to 1, got 1.5": lambda: make(gamma=1.5),
     "guidance must be one of ['normalized', 'posterior', 'score'] or None, got 'plain'": lambda: make(guidance="plain"),
     "VecNormalize scales the rewards already: pass norm_reward=False to it": preload_twice_scaled,
+    "The policy was trained on raw observations, and this VecNormalize would give it": normalise_a_raw_policy,
     "HerReplayBuffer computes rewards anew: reward_transform must be 'none' with it": preload_with_hindsight,
     "There is nothing to train on: call preload(source) or load_replay_buffer(path) first": lambda: make().pretrain(1),
     "The world model has not been trained": lambda: make().intervene(np.zeros(3), np.zeros(1), {}),

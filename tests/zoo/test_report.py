@@ -243,6 +243,98 @@ def test_what_is_missing_is_said(zoo, run):
     assert "Not recorded" in page.text("Command")
 
 
+def emptied(path):
+    path.write_bytes(b"")
+
+
+def cut(path):
+    content = path.read_bytes()
+    path.write_bytes(content[: len(content) // 2])
+
+
+def mixed_up(path):
+    path.write_bytes(b"[1, 2\n\x80\xff: }")
+
+
+@pytest.mark.parametrize("damage", [emptied, cut, mixed_up])
+def test_files_that_are_damaged_are_named_where_they_are_missed_and_the_rest_is_shown(zoo, run, damage):
+    settings = run / "Pendulum-v1"
+    monitor = next(run.glob("*.monitor.csv"))
+    for path in (
+        run / "evaluations.npz",
+        run / "replay_buffer.pkl",
+        run / "rl_model_250_steps.zip",
+        settings / "versions.yml",
+    ):
+        damage(path)
+    if damage is not cut:
+        # Half of it may still be settings
+        damage(settings / "config.yml")
+        damage(monitor)
+    zoo("report", run, "--episodes", 1)
+    page = Page(run / "report.html")
+    assert list(page.sections) == [title.lower().replace(" ", "-") for title in SECTIONS]
+    said = "is left out, because it is empty, cut off, damaged or not trusted: "
+    assert f"evaluations.npz {said}" in page.text("Learning curve")
+    assert f"replay_buffer.pkl {said}" in page.text("Effects of the actions")
+    assert f"rl_model_250_steps.zip {said}" in page.text("History of the graph")
+    if damage is not cut:
+        assert f"{monitor.name} {said}" in page.text("Learning curve") and "config.yml " in page.text("Hyperparameters")
+        assert "versions.yml is " in page.text("Versions")
+        assert "No training episode has ended" in page.text("Learning curve")
+    else:
+        assert "50 steps of the episodes that the model played" in page.text("Effects of the actions")
+        assert len(page.images("Effects of the actions")) == 1
+    assert "Pendulum-v1.zip (final), 300 environment steps" in page.text("Summary")
+    assert len(page.images("Causal graph")) == 2
+
+
+def test_rows_of_a_monitor_file_that_are_cut_are_left_out(run):
+    episodes = RunFolder(run).training_episodes()
+    path = next(run.glob("*.monitor.csv"))
+    with path.open("a") as file:
+        file.write("-12.5,5")
+    run_folder = RunFolder(run)
+    found = run_folder.training_episodes()
+    np.testing.assert_array_equal(found.returns, episodes.returns)
+    np.testing.assert_array_equal(found.steps, np.arange(50, 301, 50))
+    np.testing.assert_allclose(found.seconds, episodes.seconds)
+    assert run_folder.problems == {path.name: f"{path.name} is cut off or damaged: 1 of 7 rows are left out"}
+
+
+def test_an_empty_monitor_file_beside_others_takes_none_with_it(run):
+    (run / "1.monitor.csv").touch()
+    run_folder = RunFolder(run)
+    assert len(run_folder.training_episodes().returns) == 6 and list(run_folder.problems) == ["1.monitor.csv"]
+
+
+def test_of_a_model_that_is_cut_off_the_newest_whole_one_takes_the_place(zoo, run):
+    shutil.copy(run / "rl_model_250_steps.zip", run / "rl_model_280_steps.zip")
+    cut(run / "Pendulum-v1.zip")
+    for age, name in enumerate(("rl_model_280_steps.zip", "best_model.zip", "rl_model_250_steps.zip")):
+        os.utime(run / name, (1e9 - age, 1e9 - age))
+    zoo("report", run, "--episodes", 0)
+    summary = Page(run / "report.html").text("Summary")
+    assert (
+        "Pendulum-v1.zip is left out, because it is empty" in summary
+        and "rl_model_280_steps.zip (checkpoint), 250 env" in summary
+    )
+    cut(run / "rl_model_280_steps.zip")
+    zoo("report", run, "--episodes", 0)
+    assert "best_model.zip (best)" in Page(run / "report.html").text("Summary")
+
+
+def test_an_environment_that_fails_while_it_is_played_is_no_reason_to_stop(zoo, run, monkeypatch):
+    def step(self, action):
+        raise ArithmeticError("broken arm.")
+
+    monkeypatch.setattr("gymnasium.envs.classic_control.pendulum.PendulumEnv.step", step)
+    zoo("report", run)
+    page = Page(run / "report.html")
+    assert "Not played: ArithmeticError: broken arm. " in page.text("Evaluation")
+    assert len(page.images("Effects of the actions")) == 1
+
+
 def test_an_environment_that_is_not_here_is_no_reason_to_stop(zoo, run):
     settings = run / "Pendulum-v1" / "args.yml"
     settings.write_text(settings.read_text().replace("- Pendulum-v1", "- Elsewhere-v0"))
