@@ -416,7 +416,7 @@ class CausalGDP(OfflineToOnlineAlgorithm):
         made_by = [name, self.causal_discovery_kwargs, *forgetting]  # a list, as it comes back from the zip
         if self.causal_statistics is None or self._statistics_made_by != made_by:
             # Another method, which load() may have brought, gathers anew from the replay buffer
-            self.causal_statistics = make_statistics(self.discovery, self.transition_variables, *forgetting)
+            self.causal_statistics = self._new_statistics()
             self._statistics_made_by = made_by
             self._fed_position = self._fed_offline_position = 0
             self._fed_marks = []
@@ -450,6 +450,12 @@ class CausalGDP(OfflineToOnlineAlgorithm):
             raise ValueError(f"buffer_size must be at least 2 n_envs with optimize_memory_usage, got {self.buffer_size}")
         if self.replay_buffer_class is not None or self.n_steps == 1:
             check_keywords("replay_buffer_kwargs", self.replay_buffer_kwargs, self.replay_buffer_class or ReplayBuffer)
+
+    def _new_statistics(self) -> Statistics:
+        try:
+            return make_statistics(self.discovery, self.transition_variables, self.causal_half_life, self.causal_window)
+        except ValueError as error:
+            raise ValueError(f"causal_half_life and causal_window: {error}") from error
 
     def _own_policy_kwargs(self) -> dict[str, Any]:
         names = (
@@ -1182,7 +1188,7 @@ class CausalGDP(OfflineToOnlineAlgorithm):
             if graph is not None and getattr(graph, "variables", None) != self.transition_variables:
                 raise ValueError(f"its causal graph is of other variables: {str(graph)[:80]}")
         statistics = self.causal_statistics
-        fresh = make_statistics(self.discovery, self.transition_variables, self.causal_half_life, self.causal_window)
+        fresh = self._new_statistics()
         of_same = all(getattr(statistics, name, None) == getattr(fresh, name, None) for name in ("variables", "n_variables"))
         if type(statistics) is not type(fresh) or not of_same:
             raise ValueError(

@@ -61,7 +61,8 @@ def copies(model, path):
     """Two models that go on from this one, the second with recordings."""
     model.save(path / "model")
     model.save_replay_buffer(path / "buffer")
-    loaded = [CausalGDP.load(path / "model", env=model.get_env(), device=model.device) for _ in range(2)]
+    # Its learning rate is a function
+    loaded = [CausalGDP.load(path / "model", env=model.get_env(), device=model.device, trusted=True) for _ in range(2)]
     for one in loaded:
         one.load_replay_buffer(path / "buffer")
         one.set_logger(Logger(None, []))

@@ -148,7 +148,7 @@ def test_every_variant_trains(kwargs):
     assert model._n_updates == 8
     assert model.policy.is_guided == ("guidance" not in kwargs or kwargs["guidance"] is not None)
     losses = [value for name, value in model.logger.name_to_value.items() if name.endswith("_loss")]
-    assert len(losses) == 6 and np.isfinite(losses).all()
+    assert len(losses) == 7 and np.isfinite(losses).all()
 
 
 @pytest.mark.parametrize("n_critics", [1, 3])

@@ -136,7 +136,7 @@ class CausalGDPLearner:
 
     def load(self, path: Path, n_updates: int) -> None:
         with path.open("rb") as file:
-            self.model = CausalGDP.load(file, device="cpu")
+            self.model = CausalGDP.load(file, device="cpu", trusted=True)
         # Other batches than those of the first updates
         self.model.set_random_seed(self.seed + n_updates)
 

@@ -25,7 +25,7 @@ def test_one_run_is_evaluated_in_both_stages_and_trained_in_both(tmp_path, monke
     ensure_dataset(TASK, STEPS)
     rows = fine_tune(TASK, "no_guidance", 0, tmp_path, 4, 8, 2, 1, STEPS, QUICK)
     assert [(row["stage"], row["count"]) for row in rows] == [("offline", 2), ("offline", 4), ("online", 4), ("online", 8)]
-    model = CausalGDP.load(tmp_path / "model")
+    model = CausalGDP.load(tmp_path / "model", trusted=True)
     assert model.num_timesteps == 8 and model._n_updates == 4 + 8
 
 
