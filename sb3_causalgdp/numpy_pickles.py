@@ -77,8 +77,8 @@ class _CheckedState:
 
     def __reduce__(self) -> Any:
         # As numpy's own, so that it is pickled as such
-        make, (_, *rest), *state = self.numpy_class.__reduce__(self)
-        return make, (self.numpy_class, *rest), *state
+        make, arguments, *state = self.numpy_class.__reduce__(self)  # type: ignore[call-arg, misc, str-unpack]
+        return make, (self.numpy_class, *arguments[1:]), *state
 
 
 class MT19937(_CheckedState, np.random.MT19937):

@@ -92,7 +92,8 @@ def test_rates_and_schedules_survive_saving_and_new_ones_take_effect():
     model = learn(learning_rate=halving(1e-3), critic_learning_rate=halving(2e-3), world_model_learning_rate=3e-3)
     stream = io.BytesIO()
     model.save(stream)
-    loaded = CausalGDP.load(stream, env=model.env, device="cpu")
+    # The functions are pickled
+    loaded = CausalGDP.load(stream, env=model.env, device="cpu", trusted=True)
     assert rates(loaded) == rates(model)
     loaded.learn(16)
     np.testing.assert_allclose(rates(loaded), [5e-4, 1e-3, 3e-3])
@@ -101,6 +102,7 @@ def test_rates_and_schedules_survive_saving_and_new_ones_take_effect():
         stream,
         env=model.env,
         device="cpu",
+        trusted=True,
         learning_rate=1e-5,
         custom_objects={"critic_learning_rate": None, "world_model_learning_rate": 2e-5},
     )
