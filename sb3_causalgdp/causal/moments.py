@@ -349,8 +349,9 @@ class StreamingMoments:
         n_rows = np.inf if self.window is None else (self.n_blocks - 1) * self._block_rows + 1.0
         if self.half_life is None:
             return float(n_rows)
-        fading = 0.5 ** (1.0 / self.half_life)
-        return float((1.0 - fading**n_rows) / (1.0 - fading))
+        # By expm1, because a fading of one row after a very long half-life is 1 in double precision
+        rate = np.log(0.5) / self.half_life
+        return float(np.expm1(rate * n_rows) / np.expm1(rate))
 
     @property
     def mean(self) -> np.ndarray:

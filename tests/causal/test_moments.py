@@ -332,3 +332,10 @@ def test_variables_need_distinct_names():
         TransitionVariables((), ("x",))
     with pytest.raises(TypeError, match="action_names"):
         TransitionVariables(("x",), "force")
+
+
+@pytest.mark.parametrize(
+    ("half_life", "window", "expected"), [(1.0, None, 2.0), (1e18, None, 1e18 / np.log(2.0)), (1e18, 8, 8.0)]
+)
+def test_the_fewest_rows_that_are_kept_follow_from_half_life_and_window(half_life, window, expected):
+    assert StreamingMoments(2, half_life, window=window).fewest_rows == pytest.approx(expected, rel=0.2)
