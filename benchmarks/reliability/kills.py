@@ -121,7 +121,8 @@ def writers() -> dict[str, tuple[Callable[[Path], Any], Callable[[Path], Any], s
     return {
         "model.save": (model.save, lambda path: CausalGDP.load(path), "model.zip"),
         "policy.save": (model.policy.save, lambda path: MlpPolicy.load(path), "policy.pt"),
-        "save_replay_buffer": (model.save_replay_buffer, read_buffer, "buffer.pkl"),
+        "save_replay_buffer": (model.save_replay_buffer, read_buffer, "buffer.npz"),
+        "save_replay_buffer, pickled": (model.save_replay_buffer, read_buffer, "buffer.pkl"),
         "save_checkpoint, file": (model.save_checkpoint, lambda path: CausalGDP.resume(path, setup.make_env(0)), "there.zip"),
         "save_checkpoint, folder": (model.save_checkpoint, lambda path: CausalGDP.resume(path, setup.make_env(0)), "there"),
         "graph.save": (graph.save, CausalGraph.load, "graph.json"),
@@ -130,42 +131,54 @@ def writers() -> dict[str, tuple[Callable[[Path], Any], Callable[[Path], Any], s
     }
 
 
-def write_forever(name: str) -> None:
-    """Until the process is killed; the first time before it says that it is ready."""
-    write, _, file = writers()[name]
-    write(Path(file).absolute())
-    print(READY, flush=True)
-    while True:
-        write(Path(file).absolute())
-
-
-def write_once(name: str) -> None:
-    write, read, file = writers()[name]
-    path = Path(file).absolute()
-    try:
-        read(path)
-        print("whole", flush=True)
-    except Exception as error:
-        print(f"torn: {error}", flush=True)
-    write(path)
-    read(path)
-    print(len([left for left in Path().rglob("*") if left.name.startswith((".writing-", ".making-"))]), flush=True)
+def write_until_killed(write: Callable[[Path], Any], path: Path, delay: float) -> None:
+    """In a process that is a copy of this one, which is killed so many seconds after it began to write."""
+    ready, begun = os.pipe()
+    child = os.fork()
+    if child == 0:
+        os.write(begun, b"1")
+        while True:
+            write(path)
+    os.read(ready, 1)
+    time.sleep(delay)
+    os.kill(child, signal.SIGKILL)
+    os.waitpid(child, 0)
+    os.close(ready)
+    os.close(begun)
 
 
 def kill_writers(names: list[str], n_kills: int, generator: random.Random) -> int:
-    n_wrong = 0
+    import torch as th
+
+    th.set_num_threads(1)
+    n_wrong, all_writers = 0, writers()
     per_writer = -(-n_kills // len(names))
     for name in names:
+        write, read, file = all_writers[name]
         with tempfile.TemporaryDirectory() as scratch:
+            path = Path(scratch, file)
+            write(path)
+            start = time.perf_counter()
+            write(path)
+            seconds = time.perf_counter() - start
             torn = left = 0
             for _ in range(per_writer):
-                _run("write", name, Path(scratch), generator.uniform(0.0, 0.3))
-                output = (_run("check", name, Path(scratch), None) or "").splitlines()
-                torn += output[:1] != ["whole"]
-                left += output[1:2] != ["0"]
+                write_until_killed(write, path, generator.uniform(0.0, 3.0 * seconds))
+                torn += not _is_whole(read, path)
+                write(path)
+                left += any(one.name.startswith((".writing-", ".making-")) for one in Path(scratch).rglob("*"))
             print(f"{name}: {per_writer} kills, {torn} torn, {left} with temporaries left", flush=True)
             n_wrong += torn + left
     return n_wrong
+
+
+def _is_whole(read: Callable[[Path], Any], path: Path) -> bool:
+    try:
+        read(path)
+        return True
+    except Exception as error:
+        print(f"{path.name}: {error}", file=sys.stderr)
+        return False
 
 
 # Processes ----------------------------------------------------------------------------------------------------------------
@@ -221,7 +234,8 @@ def main() -> None:
     arguments = parser.parse_args()
     if arguments.one:
         command, name = arguments.one
-        {"train": train, "write": write_forever, "check": write_once}[command](name)
+        assert command == "train"
+        train(name)
         return
     generator = random.Random(arguments.seed)
     if arguments.what == "trainings":
