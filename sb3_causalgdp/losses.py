@@ -12,7 +12,6 @@ from sb3_causalgdp.diffusion.guidance import Guidance, GuidanceRule, guidance_sh
 from sb3_causalgdp.diffusion.samplers import Denoiser, bind
 from sb3_causalgdp.diffusion.schedules import NoiseSchedule
 
-
 # So small that only zeros are smaller
 SMALLEST_SCALE = 1e-20
 # Of the level of Q: differences below are rounding

@@ -5,8 +5,8 @@ from collections.abc import Sequence
 from typing import Any
 
 from sb3_causalgdp.causal.graph import PLOTS_HINT
-from sb3_causalgdp.files import replaced_when_done
 from sb3_causalgdp.causal.variables import TransitionVariables
+from sb3_causalgdp.files import replaced_when_done
 
 try:
     from matplotlib.backends.backend_agg import FigureCanvasAgg

@@ -9,7 +9,6 @@ import numpy as np
 
 from sb3_causalgdp.causal.figures import FONT_SIZE, check_choice, check_suffix, save_figure
 from sb3_causalgdp.causal.graph import PLOTS_HINT, CausalGraph
-from sb3_causalgdp.files import replaced_when_done
 from sb3_causalgdp.causal.heat_maps import (
     VALUES,
     draw_matrix,
@@ -22,6 +21,7 @@ from sb3_causalgdp.causal.heat_maps import (
 )
 from sb3_causalgdp.causal.summary import Groups, Summary, summarize
 from sb3_causalgdp.causal.variables import TransitionVariables
+from sb3_causalgdp.files import replaced_when_done
 
 try:
     from matplotlib.backends.backend_agg import FigureCanvasAgg

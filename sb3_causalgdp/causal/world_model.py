@@ -9,7 +9,6 @@ from torch import nn
 from sb3_causalgdp.activations import tanh_
 from sb3_causalgdp.products import linear
 
-
 SMALLEST_STD = 1e-12
 ROUNDINGS = 8.0 * th.finfo(th.float32).eps
 
