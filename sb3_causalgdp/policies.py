@@ -1,5 +1,7 @@
 """Diffusion actor, double critics, their targets and the causal world model, as one SB3 policy."""
 
+import io
+import pathlib
 import pickle
 from collections.abc import Mapping, Sequence
 from typing import Any, BinaryIO, TypeVar
@@ -493,8 +495,14 @@ class CausalGDPPolicy(BasePolicy):
             CONTENT: entries[CONTENT].decode(),
             BLOCK: th.frombuffer(bytearray(entries[BLOCK] or b"0"), dtype=th.uint8),
         }
+        # First in memory: on a full disk, PyTorch's error would be about a position
+        stream = io.BytesIO()
+        th.save(saved, stream)
         with saved_when_done(path, "") as file:
-            th.save(saved, file)
+            if isinstance(file, pathlib.Path):
+                file.write_bytes(stream.getbuffer())
+            else:
+                file.write(stream.getbuffer())
 
     @classmethod
     def load(  # type: ignore[override]

@@ -3,16 +3,19 @@ Kill processes with SIGKILL at random moments, start the same command again, and
 
     python benchmarks/reliability/kills.py trainings --kills 10
     python benchmarks/reliability/kills.py writers --kills 200
+    python benchmarks/reliability/kills.py full_disk
 
 ``trainings``: those of ``tests/checkpoints/setups.py`` that the table names; each is killed again and again until it has been
 killed often enough and ends. Its weights have to be bit for bit those of a training that nobody killed. ``writers``: whatever
-the package writes, in a loop; the file has to be whole, and behind the next writing no temporary may be left.
+the package writes, in a loop; the file has to be whole, and behind the next writing no temporary may be left. ``full_disk``:
+a disk that takes half of what is to be written; the old file has to stay, and the error to be one line.
 """
 
 import argparse
 import hashlib
 import os
 import random
+import resource
 import signal
 import subprocess
 import sys
@@ -172,6 +175,36 @@ def kill_writers(names: list[str], n_kills: int, generator: random.Random) -> in
     return n_wrong
 
 
+def fill_disk(names: list[str]) -> int:
+    """A limit of the size of files stands for a full disk."""
+    n_wrong, all_writers = 0, writers()
+    for name in names:
+        write, read, file = all_writers[name]
+        with tempfile.TemporaryDirectory() as scratch:
+            path = Path(scratch, file)
+            write(path)
+            sizes = [one.stat().st_size for one in (path, *path.rglob("*")) if one.is_file()]
+            child = os.fork()
+            if child == 0:
+                os._exit(_write_with_limit(write, path, max(sizes) // 2))
+            said_so = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+            whole = _is_whole(read, path)
+            left = any(one.name.startswith(".writing-") for one in Path(scratch).rglob("*"))
+            print(f"{name}: {'one line' if said_so else 'NO ERROR'}, {'whole' if whole else 'TORN'}{', TEMPORARIES' * left}")
+            n_wrong += not said_so or not whole or left
+    return n_wrong
+
+
+def _write_with_limit(write: Callable[[Path], Any], path: Path, n_bytes: int) -> int:
+    signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (n_bytes, n_bytes))
+    try:
+        write(path)
+    except Exception as error:
+        return int("\n" in str(error).strip())
+    return 1
+
+
 def _is_whole(read: Callable[[Path], Any], path: Path) -> bool:
     try:
         read(path)
@@ -226,7 +259,7 @@ def _run(command: str, name: str, folder: Path, delay: float | None) -> str | No
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", nargs="?", choices=("trainings", "writers"))
+    parser.add_argument("what", nargs="?", choices=("trainings", "writers", "full_disk"))
     parser.add_argument("--kills", type=int, default=10, help="of each training, or of all writers")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--only", nargs="+", help="names of trainings or writers")
@@ -240,6 +273,8 @@ def main() -> None:
     generator = random.Random(arguments.seed)
     if arguments.what == "trainings":
         wrong = kill_trainings(arguments.only or list(TRAININGS), arguments.kills, generator)
+    elif arguments.what == "full_disk":
+        wrong = fill_disk(arguments.only or list(writers()))
     else:
         wrong = kill_writers(arguments.only or list(writers()), arguments.kills, generator)
     sys.exit(wrong > 0)
