@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 from gymnasium import spaces
-from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback, ProgressBarCallback
 from stable_baselines3.common.noise import ActionNoise, VectorizedActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
@@ -516,7 +516,21 @@ class OfflineToOnlineAlgorithm(OffPolicyAlgorithm):
 
     def _fitting(self, buffer: ReplayBuffer, name: str) -> ReplayBuffer:
         check_loaded_buffer(buffer, self.observation_space, self.action_space, name)
+        buffer = self._with_own_returns(buffer)
         return buffer if buffer.n_envs == self.n_envs else in_columns(buffer, self.n_envs, self._new_buffer, name)
+
+    def _with_own_returns(self, buffer: ReplayBuffer) -> ReplayBuffer:
+        """Rows are of single steps in both kinds of buffer: of how many steps returns are, the model says."""
+        plain = (ReplayBuffer, NStepReplayBuffer)
+        if type(buffer) in plain and self.replay_buffer_class in plain and type(buffer) is not self.replay_buffer_class:
+            own = self._new_buffer(buffer.buffer_size * self.n_envs)
+            copied = {name: value for name, value in vars(buffer).items() if name not in ("n_steps", "gamma", "device")}
+            vars(own).update(copied)
+            return own
+        if isinstance(buffer, NStepReplayBuffer):
+            returns = {name: value for name, value in self.replay_buffer_kwargs.items() if name in ("n_steps", "gamma")}
+            vars(buffer).update(returns)
+        return buffer
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "offline_buffer", "_offline_marks", "_buffer_with_episode"]

@@ -185,6 +185,27 @@ def test_returns_of_several_steps_do_not_reach_over_a_gap(tmp_path):
         assert batch.dones[0] == 0
 
 
+@pytest.mark.parametrize("suffix", ["npz", "pkl"])
+def test_a_loaded_buffer_gives_the_returns_of_the_model_and_not_those_of_another(tmp_path, suffix):
+    for n_steps in (1, 2, 3):
+        model = Setup(arguments={"n_steps": n_steps}).make_model().learn(64)
+        model.save_replay_buffer(tmp_path / f"{n_steps}.{suffix}")
+    for wanted in (1, 3):
+        for saved in (1, 2, 3):
+            model = Setup(arguments={"n_steps": wanted, "gamma": 0.9}).make_model()
+            model.num_timesteps = 64
+            kind = type(model.replay_buffer)
+            model.load_replay_buffer(tmp_path / f"{saved}.{suffix}")
+            buffer = model.replay_buffer
+            assert type(buffer) is kind and buffer.size() == 64
+            if wanted > 1:
+                assert (buffer.n_steps, buffer.gamma) == (wanted, 0.9)
+            batch = buffer._get_samples(np.array([10]))
+            np.testing.assert_allclose(
+                batch.rewards[0, 0], sum(0.9**i * buffer.rewards[10 + i, 0] for i in range(wanted)), rtol=1e-5
+            )
+
+
 def test_a_model_and_a_buffer_of_other_steps_are_not_of_one_moment(tmp_path):
     model = Setup().make_model().learn(64)
     model.save(tmp_path / "model")
