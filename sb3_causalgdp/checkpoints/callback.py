@@ -36,6 +36,7 @@ class TrainingCheckpointCallback(BaseCallback):
     :raises ValueError: If ``every`` or ``keep`` is below 1, and when the training starts, if the folder is another training's
     """
 
+    model: Any  # an OffPolicyAlgorithm
     during_pretraining = True
     counts_nothing = True
 
@@ -66,8 +67,8 @@ class TrainingCheckpointCallback(BaseCallback):
         self._saved_at: int | None = None
 
     def _on_training_start(self) -> None:
-        begin_training(self._algorithm, self._top)
-        check_folder(self._algorithm, self.folder)
+        begin_training(self.model, self._top)
+        check_folder(self.model, self.folder)
         self._saved_at = self.num_timesteps
         self._restore_handler()
         if self.handle_sigterm and threading.current_thread() is threading.main_thread():
@@ -98,7 +99,7 @@ class TrainingCheckpointCallback(BaseCallback):
             sys.exit(TERMINATED)
 
     def _save(self) -> None:
-        path = save_checkpoint(self._algorithm, self.folder, self._top, self.keep)
+        path = save_checkpoint(self.model, self.folder, self._top, self.keep)
         self._saved_at = self.model.num_timesteps
         if self.verbose >= 1:
             print(f"Checkpoint after {self.model.num_timesteps} steps: {path}")
@@ -114,10 +115,6 @@ class TrainingCheckpointCallback(BaseCallback):
         if self._handler_before is not None:
             signal.signal(signal.SIGTERM, self._handler_before)
             self._handler_before = None
-
-    @property
-    def _algorithm(self) -> Any:
-        return self.model
 
     @property
     def _top(self) -> BaseCallback:

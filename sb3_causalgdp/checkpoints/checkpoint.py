@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import torch as th
@@ -58,7 +59,7 @@ class Bookkeeping:
     :param logs: Of its replay buffers
     :param callbacks: States of the callbacks, until those of the resumed training are there
     :param attributes: Of the model, until ``learn()`` has started
-    :param fresh: Values of callbacks as they were made, by their ``id``: what differs later was counted
+    :param fresh: Values of callbacks as they were made: what differs later was counted
     :param of_pretraining: Whether a resumed model was in ``pretrain()``
     :param was_complete: Whether a resumed model had taken all steps of that call
     :param said: Whether it was said what of the environments cannot be saved
@@ -69,7 +70,7 @@ class Bookkeeping:
     logs: dict[str, Log] = field(default_factory=dict)
     callbacks: list[dict[str, Any]] = field(default_factory=list)
     attributes: dict[str, Any] = field(default_factory=dict)
-    fresh: dict[int, dict[str, bytes]] = field(default_factory=dict)
+    fresh: "WeakKeyDictionary[BaseCallback, dict[str, bytes]]" = field(default_factory=WeakKeyDictionary)
     of_pretraining: bool = False
     was_complete: bool = True
     said: bool = False
@@ -371,7 +372,7 @@ def begin_training(model: OffPolicyAlgorithm, callback: BaseCallback) -> None:
     """
     own = bookkeeping_of(model)
     for one in all_callbacks(callback):
-        own.fresh.setdefault(id(one), {name: to_bytes(value) for name, value in _plain_values(one).items()})
+        own.fresh.setdefault(one, {name: to_bytes(value) for name, value in _plain_values(one).items()})
     vars(model).update(own.attributes)
     states, own.callbacks, own.attributes = own.callbacks, [], {}
     if own.of_pretraining == _is_pretraining(model):
@@ -395,14 +396,14 @@ def all_callbacks(callback: BaseCallback) -> list[BaseCallback]:
     return found
 
 
-def callback_states(callback: BaseCallback, fresh: Mapping[int, dict[str, bytes]]) -> list[dict[str, Any]]:
+def callback_states(callback: BaseCallback, fresh: Mapping[BaseCallback, dict[str, bytes]]) -> list[dict[str, Any]]:
     """
     :param callback: All callbacks of a training
     :param fresh: Their values when the training began
     :return: For each, its class, what it counted and gathered, and the state of its environments
     """
     return [
-        {"class": _name(one), "values": _counted(one, fresh.get(id(one), {})), "environments": _callback_environments(one)}
+        {"class": _name(one), "values": _counted(one, fresh.get(one, {})), "environments": _callback_environments(one)}
         for one in all_callbacks(callback)
     ]
 

@@ -67,7 +67,7 @@ def remove_old(folder: Path, keep: int) -> None:
         remove_folder(path)
     named: set[str] = set()
     for path in checkpoints[-keep:]:
-        named.update(json.loads((path / MANIFEST).read_text(encoding="utf-8"))["files"])
+        named.update(_manifest_of(path).get("files", {}))
     for file in (folder / FOLDER).glob("*.npz"):
         if f"{FOLDER}/{file.name}" not in named:
             file.unlink()
@@ -87,12 +87,16 @@ def run_of(folder: Path) -> str | None:
     :param folder: Of checkpoints
     :return: The training that they are of, None if there is none
     """
-    for path in reversed(list(checkpoint_folders(folder))):
-        try:
-            return json.loads((path / MANIFEST).read_text(encoding="utf-8"))["run"]
-        except (OSError, ValueError, KeyError):
-            continue
-    return None
+    runs = (_manifest_of(path).get("run") for path in reversed(list(checkpoint_folders(folder))))
+    return next((run for run in runs if run is not None), None)
+
+
+def _manifest_of(path: Path) -> dict[str, Any]:
+    """What a checkpoint says of itself, nothing if it is damaged."""
+    try:
+        return dict(json.loads((path / MANIFEST).read_text(encoding="utf-8")))
+    except (OSError, ValueError, TypeError):
+        return {}
 
 
 @contextmanager
@@ -185,12 +189,8 @@ def _digest(file: BinaryIO) -> str:
 
 def _known_sums(folder: Path) -> dict[str, str]:
     """Of the files that the newest checkpoint names: they are not read again."""
-    for path in reversed(list(checkpoint_folders(folder))):
-        try:
-            return json.loads((path / MANIFEST).read_text(encoding="utf-8"))["files"]
-        except (OSError, ValueError, KeyError):
-            return {}
-    return {}
+    newest = list(checkpoint_folders(folder))[-1:]
+    return _manifest_of(newest[0]).get("files", {}) if newest else {}
 
 
 def _next_number(folder: Path) -> int:
