@@ -3,6 +3,16 @@ import os
 # One thread per process, or the workers of pytest-xdist fight for the cores. OpenMP reads this once, when torch is imported.
 os.environ["OMP_NUM_THREADS"] = "1"
 
+import pytest
 import torch
+from hostile import Hostile
 
 torch.set_num_threads(1)
+
+
+@pytest.fixture
+def hostile(tmp_path):
+    """What would run code; at the end, nothing has."""
+    mark = tmp_path / "mark"
+    yield Hostile(mark)
+    assert not mark.exists()

@@ -38,24 +38,6 @@ TINY = {
 OLD = Path(__file__).parent / "data" / "pickled_model.zip"
 
 
-class Hostile:
-    """Touches a file when it is unpickled."""
-
-    def __init__(self, mark):
-        self.mark = mark
-
-    def __reduce__(self):
-        return os.system, (f"touch {self.mark}",)
-
-
-@pytest.fixture
-def hostile(tmp_path):
-    """What would run code; at the end, nothing has."""
-    mark = tmp_path / "mark"
-    yield Hostile(mark)
-    assert not mark.exists()
-
-
 @pytest.fixture(scope="module")
 def model():
     return CausalGDP("MlpPolicy", "Pendulum-v1", **TINY, causal_refresh_freq=210, learning_starts=200).learn(230)

@@ -276,6 +276,14 @@ def test_the_newest_whole_checkpoint_is_taken(folder, damaged):
         CausalGDP.resume(folder, Setup().make_env(0))
 
 
+def test_a_damaged_older_checkpoint_does_not_end_a_training(folder):
+    older, _ = checkpoints(folder)
+    (older / "manifest.json").write_text("{")
+    model = CausalGDP.resume(folder, Setup().make_env(0))
+    model.learn(8, TrainingCheckpointCallback(folder, every=8, keep=3), reset_num_timesteps=False)
+    assert CausalGDP.resume(folder, Setup().make_env(0)).num_timesteps == model.num_timesteps
+
+
 def test_what_cannot_be_resumed_is_said_in_one_line(folder, tmp_path):
     with pytest.raises(FileNotFoundError, match="there is no checkpoint"):
         CausalGDP.resume(tmp_path, Setup().make_env(0))

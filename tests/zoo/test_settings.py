@@ -1,5 +1,4 @@
 import importlib
-import os
 import pickle
 from collections import OrderedDict
 
@@ -14,20 +13,6 @@ from sb3_causalgdp.zoo.registration import SetupError
 from sb3_causalgdp.zoo.report import report
 from sb3_causalgdp.zoo.run_folder import RunFolder
 from sb3_causalgdp.zoo.settings import check_modules, check_normalize, load_normalizer, read_settings, safe_files
-
-
-class Hostile:
-    def __init__(self, mark):
-        self.mark = mark
-
-    def __reduce__(self):
-        return os.system, (f"touch {self.mark}",)
-
-
-@pytest.fixture
-def hostile(tmp_path):
-    yield Hostile(tmp_path / "mark")
-    assert not (tmp_path / "mark").exists()
 
 
 def test_what_rl_zoo_writes_is_read(tmp_path):
