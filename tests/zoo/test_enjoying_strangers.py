@@ -3,8 +3,8 @@
 import pickle
 
 import pytest
-from hostile import Hostile
 import torch as th
+from hostile import Hostile
 
 pytest.importorskip("rl_zoo3")
 from sb3_causalgdp import CausalGDP
