@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+from sb3_causalgdp import moved  # noqa: F401  the old names of modules
 from sb3_causalgdp.callbacks import CausalWorldModelCallback
 from sb3_causalgdp.causalgdp import CausalGDP
 from sb3_causalgdp.checkpoints import TrainingCheckpointCallback

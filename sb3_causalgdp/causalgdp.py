@@ -22,7 +22,9 @@ from stable_baselines3.common.save_util import load_from_zip_file, open_path, re
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.utils import FloatSchedule, get_parameters_by_name, polyak_update, update_learning_rate
 
-from sb3_causalgdp.archives import errors_of
+from sb3_causalgdp.acceleration.cuda_graphs import UpdateGraphs, why_not_recorded
+from sb3_causalgdp.acceleration.device_replay import DeviceReplay
+from sb3_causalgdp.acceleration.gradients import Gradients, check_compile, compiled, gradients_of, without_checks
 from sb3_causalgdp.arguments import (
     CONSTRUCTOR_ARGUMENTS,
     POLICY_ARGUMENTS,
@@ -48,18 +50,16 @@ from sb3_causalgdp.causal.world_model import MaskedWorldModel, moves
 from sb3_causalgdp.checkpoints import TrainingCheckpointCallback, begin_training, resume, save_checkpoint
 from sb3_causalgdp.checkpoints.checkpoint import all_callbacks, bookkeeping_of, end_last_episodes, fresh_seed
 from sb3_causalgdp.checks import first_not_finite_index, fits_float32, is_finite
-from sb3_causalgdp.cuda_graphs import UpdateGraphs, why_not_recorded
-from sb3_causalgdp.device_replay import DeviceReplay
 from sb3_causalgdp.divergence import ParametersError, TrainingDivergedError, check_optimizer_state, first_not_finite
 from sb3_causalgdp.files import saved_when_done
-from sb3_causalgdp.gradients import Gradients, check_compile, compiled, gradients_of, without_checks
 from sb3_causalgdp.losses import DenoisingTerms, critic_loss, denoising_loss, q_loss, quantile, td_target, world_model_loss
 from sb3_causalgdp.offline.algorithm import OfflineToOnlineAlgorithm, callback_list
 from sb3_causalgdp.offline.preload import normalised_parts
 from sb3_causalgdp.offline.replay import concatenate_samples, deal_rows, rows_of
-from sb3_causalgdp.plain import Known
 from sb3_causalgdp.policies import CausalGDPPolicy, CnnPolicy, DiffusionActor, MlpPolicy, MultiInputPolicy, q_values
-from sb3_causalgdp.saved import KNOWN, LARGE, append_entries, plain_entries, read_values
+from sb3_causalgdp.saving.archives import errors_of
+from sb3_causalgdp.saving.models import KNOWN, LARGE, append_entries, plain_entries, read_values
+from sb3_causalgdp.saving.plain import Known
 from sb3_causalgdp.structural import StatePolicy, actions_of, make_structural_model, states_of
 
 NETWORKS = ("policy", "actor", "critic", "world_model")

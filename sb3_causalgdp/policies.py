@@ -23,9 +23,9 @@ from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from stable_baselines3.common.utils import get_device
 from torch import nn
 
-from sb3_causalgdp.acting import NumpyActing
-from sb3_causalgdp.activations import fast
-from sb3_causalgdp.archives import TRUST, FileError, errors_of, named, opened, size_of
+from sb3_causalgdp.acceleration.acting import NumpyActing
+from sb3_causalgdp.acceleration.activations import fast
+from sb3_causalgdp.acceleration.products import make_layers_fast
 from sb3_causalgdp.arguments import POLICY_ARGUMENTS, check_arguments, check_keywords
 from sb3_causalgdp.causal import CausalGuidance, LinearisedGuidance, MaskedWorldModel, ReturnTarget, RewardTarget
 from sb3_causalgdp.causal.guidance import OutcomeTarget
@@ -34,9 +34,9 @@ from sb3_causalgdp.diffusion import Guidance, GuidanceRule, MLPDenoiser, NoiseSc
 from sb3_causalgdp.diffusion.samplers import bind, check_sampler
 from sb3_causalgdp.divergence import TrainingDivergedError, first_not_finite
 from sb3_causalgdp.files import saved_when_done
-from sb3_causalgdp.plain import Known, decoded, read_json
-from sb3_causalgdp.products import make_layers_fast
-from sb3_causalgdp.saved import BLOCK, CONTENT, KNOWN, check_limits, check_tensor_file, plain_entries
+from sb3_causalgdp.saving.archives import TRUST, FileError, errors_of, named, opened, size_of
+from sb3_causalgdp.saving.models import BLOCK, CONTENT, KNOWN, check_limits, check_tensor_file, plain_entries
+from sb3_causalgdp.saving.plain import Known, decoded, read_json
 
 ACTIVATIONS: dict[str, type[nn.Module]] = {
     "mish": nn.Mish,

@@ -6,20 +6,22 @@ import pytest
 import sb3_causalgdp
 
 PACKAGE = Path(sb3_causalgdp.__file__).parent
-# From the roof to the ground: imports go down; the parts of one line do not import each other
+# From the roof to the ground: imports go down; the parts of one line do not import each other. A part is a folder, or a file
 LAYERS = [
     {"zoo", "datasets"},
-    {"pictures"},
+    {"callbacks.pictures"},
     {"__init__"},
     {"causalgdp"},
     {"callbacks", "checkpoints"},
-    {"losses", "gradients", "diagnostics", "structural", "device_replay", "cuda_graphs"},
-    {"product_pass"},
+    {"callbacks.world_model"},
+    {"losses", "callbacks.diagnostics", "structural", "acceleration.device_replay", "acceleration.cuda_graphs"},
+    {"acceleration.gradients"},
+    {"acceleration.product_pass"},
     {"policies"},
-    {"acting", "arguments", "saved"},
+    {"acceleration.acting", "arguments", "saving.models"},
     {"causal", "offline", "diffusion"},
-    {"checks", "divergence", "files", "products", "activations", "plain", "archives"},
-    {"numpy_pickles"},
+    {"checks", "divergence", "files", "acceleration.products", "acceleration.activations", "saving.plain", "saving.archives"},
+    {"saving.numpy_pickles", "acceleration", "saving", "moved"},
 ]
 WITHOUT_SB3 = {
     "causal",
@@ -27,18 +29,27 @@ WITHOUT_SB3 = {
     "divergence",
     "files",
     "losses",
-    "gradients",
-    "products",
-    "product_pass",
-    "activations",
-    "cuda_graphs",
+    "moved",
+    "acceleration.gradients",
+    "acceleration.products",
+    "acceleration.product_pass",
+    "acceleration.activations",
+    "acceleration.cuda_graphs",
 }
 LEVELS = {part: level for level, parts in enumerate(LAYERS) for part in parts}
 FILES = sorted(PACKAGE.rglob("*.py"))
 
 
 def part_of(file):
-    return file.relative_to(PACKAGE).parts[0].removesuffix(".py")
+    names = file.relative_to(PACKAGE).with_suffix("").parts
+    return part_of_module(".".join(name for name in names if name != "__init__") or "__init__")
+
+
+def part_of_module(name):
+    """The longest name on the map that a module's name begins with."""
+    names = name.split(".")
+    ways = (".".join(names[:length]) for length in range(len(names), 0, -1))
+    return next((way for way in ways if way in LEVELS), names[0])
 
 
 def imported_modules(file):
@@ -51,14 +62,18 @@ def imported_modules(file):
             above = folder[: len(folder) - node.level + 1] if node.level else ()
             base = ".".join((*above, *([node.module] if node.module else [])))
             # "from sb3_causalgdp import causal" imports a part, "from sb3_causalgdp import CausalGDP" the package
-            yield from (f"{base}.{alias.name}" for alias in node.names) if base == "sb3_causalgdp" else (base,)
+            is_package = (PACKAGE.parent / Path(*base.split("."))).is_dir()
+            yield from (f"{base}.{alias.name}" for alias in node.names) if is_package else (base,)
 
 
 def imported_parts(file):
     for module in imported_modules(file):
-        if module.split(".")[0] == "sb3_causalgdp":
-            name = (*module.split("."), "__init__")[1]
-            yield name if name in {part_of(other) for other in FILES} else "__init__"
+        package, *names = module.split(".")
+        if package == "sb3_causalgdp":
+            is_part = names and (
+                names[0] in {"__init__"} or (PACKAGE / names[0]).is_dir() or (PACKAGE / f"{names[0]}.py").is_file()
+            )
+            yield part_of_module(".".join(names)) if is_part else "__init__"
 
 
 @pytest.mark.parametrize("file", FILES, ids=lambda file: str(file.relative_to(PACKAGE)))

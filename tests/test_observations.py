@@ -215,7 +215,9 @@ def test_with_vec_normalize_the_graph_is_found_in_raw_units_and_the_world_model_
     # The diagnostics see what the policy sees
     callback, seen = guided_callback(), []
     callback.init_callback(model)
-    monkeypatch.setattr("sb3_causalgdp.callbacks.guidance_divergence", lambda policy, batch: seen.append(batch) or 0.0)
+    monkeypatch.setattr(
+        "sb3_causalgdp.callbacks.world_model.guidance_divergence", lambda policy, batch: seen.append(batch) or 0.0
+    )
     callback.refresh()
     assert seen[0].shape == (8, 2) and float(seen[0].abs().max()) <= env.clip_obs
     # The mean and the statistics of another environment are used from then on

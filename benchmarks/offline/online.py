@@ -33,7 +33,7 @@ from benchmarks.offline.plot import LABELS
 from benchmarks.suite.jobs import grid
 from benchmarks.suite.run import add_run_options, run_from_options
 from sb3_causalgdp import CausalGDP
-from sb3_causalgdp.causal.figures import save_figure
+from sb3_causalgdp.causal.plots.figures import save_figure
 from sb3_causalgdp.offline.make import MAZE_TASKS
 from sb3_causalgdp.offline.mujoco_tasks import MUJOCO_TASKS
 from sb3_causalgdp.offline.scores import normalized_score

@@ -15,7 +15,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from benchmarks.offline.methods import METHODS
-from sb3_causalgdp.causal.figures import save_figure
+from sb3_causalgdp.causal.plots.figures import save_figure
 
 RESULTS = Path(__file__).parent / "results"
 LABELS = {

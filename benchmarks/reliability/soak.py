@@ -17,7 +17,7 @@ from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback,
 from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_causalgdp import CausalGDP, TrainingCheckpointCallback
-from sb3_causalgdp.pictures import CausalPicturesCallback
+from sb3_causalgdp.callbacks.pictures import CausalPicturesCallback
 
 
 def resident_megabytes() -> float:

@@ -24,7 +24,7 @@ from benchmarks.speed.results import markdown
 from benchmarks.speed.workers.causalgdp import CausalGDPContestant
 from benchmarks.speed.workers.matmuls import count_flops
 from sb3_causalgdp import CausalGDP
-from sb3_causalgdp.cuda_graphs import record
+from sb3_causalgdp.acceleration.cuda_graphs import record
 
 MODES: dict[str, dict[str, Any]] = {
     "plain": {"cuda_graph": False},

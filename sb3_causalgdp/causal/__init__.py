@@ -19,7 +19,7 @@ from sb3_causalgdp.causal.interventions import (
     StructuralModel,
     Trajectory,
 )
-from sb3_causalgdp.causal.moments import StreamingMoments
+from sb3_causalgdp.causal.statistics.moments import StreamingMoments
 from sb3_causalgdp.causal.variables import TransitionVariables
 from sb3_causalgdp.causal.world_model import MaskedWorldModel
 

@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from sb3_causalgdp.causal.degenerate import CONFOUNDED_VIF
 from sb3_causalgdp.causal.discovery import DISCOVERY_METHODS, make_discovery, make_statistics
 from sb3_causalgdp.causal.graph import CausalGraph
 from sb3_causalgdp.causal.sources import BATCH_ROWS, TransitionSource, open_source
+from sb3_causalgdp.causal.statistics.degenerate import CONFOUNDED_VIF
 
 THRESHOLD = 0.5  # of the masks that the summary lists
 SHOWN_EDGES = 40
@@ -149,7 +149,7 @@ def run(arguments: argparse.Namespace) -> None:
 def _check_plot(path: str | None) -> None:
     """Before anything is read, so that a missing package or a wrong suffix costs no time."""
     if path is not None:
-        from sb3_causalgdp.causal.plots import check_suffix
+        from sb3_causalgdp.causal.plots.figures import check_suffix
 
         check_suffix(path)
 

@@ -7,16 +7,16 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from sb3_causalgdp.archives import errors_of
 from sb3_causalgdp.causal.variables import TransitionVariables
 from sb3_causalgdp.files import replaced_when_done
+from sb3_causalgdp.saving.archives import errors_of
 
 if TYPE_CHECKING:
     import networkx as nx
     import pandas as pd
     from matplotlib.figure import Figure
 
-    from sb3_causalgdp.causal.summary import Groups
+    from sb3_causalgdp.causal.plots.summary import Groups
 
 PLOTS_HINT = 'matplotlib and networkx are needed for this: pip install "sb3_causalgdp[plots]"'
 
@@ -388,7 +388,7 @@ class CausalGraph:
         :param kind: ``"heat_map"``, ``"graph"`` or ``"both"``
         :param max_variables: More states and actions than this are summarised, see ``groups``
         :param values: What the heat map's colours are: ``"masks"``, with the signs of the effects, or ``"effects"``
-        :param groups: How to summarise, see :func:`~sb3_causalgdp.causal.summary.summarize`
+        :param groups: How to summarise, see :func:`~sb3_causalgdp.causal.plots.summary.summarize`
         :param aggregate: ``"mean"`` or ``"max"`` of a group's entries
         :return: the matplotlib figure
         :raises ImportError: when matplotlib or networkx is missing

@@ -106,7 +106,7 @@ class ActionEffects:
         :return: the matplotlib figure
         :raises ImportError: when matplotlib is missing
         """
-        from sb3_causalgdp.causal.effect_plots import plot_action_effects
+        from sb3_causalgdp.causal.plots.effects import plot_action_effects
 
         return plot_action_effects(self, path, max_actions, max_states)
 

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
-from sb3_causalgdp.archives import errors_of, existing, is_zip, load_minari, one_line, read_arrays, read_pickle
 from sb3_causalgdp.causal.variables import TransitionVariables
-from sb3_causalgdp.plain import SPACES, Known, decoded, read_json
+from sb3_causalgdp.saving.archives import errors_of, existing, is_zip, load_minari, one_line, read_arrays, read_pickle
+from sb3_causalgdp.saving.plain import SPACES, Known, decoded, read_json
 
 OFFLINE_HINT = 'pip install "sb3_causalgdp[offline]"'
 MINARI_ID = re.compile(r"[-\w]+(/[-\w]+)*-v\d+")

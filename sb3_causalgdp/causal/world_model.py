@@ -6,8 +6,8 @@ from typing import Any, NamedTuple
 import torch as th
 from torch import nn
 
-from sb3_causalgdp.activations import tanh_
-from sb3_causalgdp.products import linear
+from sb3_causalgdp.acceleration.activations import tanh_
+from sb3_causalgdp.acceleration.products import linear
 
 SMALLEST_STD = 1e-12
 ROUNDINGS = 8.0 * th.finfo(th.float32).eps

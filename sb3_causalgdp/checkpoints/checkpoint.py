@@ -23,13 +23,13 @@ from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
-from sb3_causalgdp.archives import errors_of
 from sb3_causalgdp.checkpoints.environments import environment_state, restore_environment
 from sb3_causalgdp.checkpoints.pickles import classes_in, from_bytes, to_bytes
 from sb3_causalgdp.checkpoints.store import Checkpoint, open_checkpoint, run_of, write_checkpoint
 from sb3_causalgdp.checkpoints.transitions import FOLDER, Log, rest_of, set_rest
 from sb3_causalgdp.files import replaced_when_done, temporary_folder
-from sb3_causalgdp.numpy_pickles import check_random_state
+from sb3_causalgdp.saving.archives import errors_of
+from sb3_causalgdp.saving.numpy_pickles import check_random_state
 
 SelfAlgorithm = TypeVar("SelfAlgorithm", bound=OffPolicyAlgorithm)
 

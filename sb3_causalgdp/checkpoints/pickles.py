@@ -11,8 +11,9 @@ from typing import Any
 
 from gymnasium.utils import EzPickle
 
-from sb3_causalgdp.archives import PLAIN
-from sb3_causalgdp.numpy_pickles import in_place_of
+from sb3_causalgdp.moved import current_module
+from sb3_causalgdp.saving.archives import PLAIN
+from sb3_causalgdp.saving.numpy_pickles import in_place_of
 
 CODE = (types.FunctionType, types.BuiltinFunctionType, types.MethodType, types.ModuleType, type, functools.partial)
 _MOST_OBJECTS = 100_000
@@ -127,6 +128,7 @@ class _Unpickler(pickle.Unpickler):
     def find_class(self, module: str, name: str) -> Any:
         if (module, name) == (__name__, "_blank"):
             return self._blank
+        module = current_module(module, name)
         known = self.allowed.get((module, name))
         if known is not None and (issubclass(known, enum.Enum) or hasattr(known, "_fields")):
             return known
@@ -137,6 +139,7 @@ class _Unpickler(pickle.Unpickler):
         raise _refused(module, name)
 
     def _blank(self, module: str, name: str) -> Any:
+        module = current_module(module, name)
         known = self.allowed.get((module, name))
         if known is None and self.trusted:
             known = functools.reduce(getattr, name.split("."), importlib.import_module(module))  # type: ignore[assignment]

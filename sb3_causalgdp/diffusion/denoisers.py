@@ -7,8 +7,8 @@ from itertools import pairwise
 import torch as th
 from torch import nn
 
-from sb3_causalgdp.activations import fast
-from sb3_causalgdp.products import Linear, linear
+from sb3_causalgdp.acceleration.activations import fast
+from sb3_causalgdp.acceleration.products import Linear, linear
 
 
 def sinusoidal_embedding(n_steps: int, dimension: int) -> th.Tensor:

@@ -21,7 +21,6 @@ from stable_baselines3.common.utils import FloatSchedule, configure_logger
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_normalize
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
-from sb3_causalgdp.archives import errors_of, existing
 from sb3_causalgdp.files import saved_when_done
 from sb3_causalgdp.offline.loaded_buffers import check_loaded_buffer, in_columns
 from sb3_causalgdp.offline.observations import flat_space, flattened_space, layout_name, same_layout
@@ -38,6 +37,7 @@ from sb3_causalgdp.offline.replay import SpacesEnv, can_sample
 from sb3_causalgdp.offline.rewards import RewardTransform, check_reward_transform
 from sb3_causalgdp.offline.saved_buffers import SUFFIXES, can_be_arrays, read_buffer, write_buffer
 from sb3_causalgdp.offline.sources import Source, open_source
+from sb3_causalgdp.saving.archives import errors_of, existing
 
 SelfAlgorithm = TypeVar("SelfAlgorithm", bound="OfflineToOnlineAlgorithm")
 

@@ -12,8 +12,8 @@ from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer
 from stable_baselines3.her.goal_selection_strategy import GoalSelectionStrategy
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
-from sb3_causalgdp.archives import errors_of, is_zip, named, opened, read_arrays, read_pickle, write_arrays
-from sb3_causalgdp.plain import FORMAT, SPACES, Known, NotPlainError, Writer, decoded, read_json
+from sb3_causalgdp.saving.archives import errors_of, is_zip, named, opened, read_arrays, read_pickle, write_arrays
+from sb3_causalgdp.saving.plain import FORMAT, SPACES, Known, NotPlainError, Writer, decoded, read_json
 
 SUFFIXES = (".npz", ".pkl")
 BUFFERS = (ReplayBuffer, DictReplayBuffer, NStepReplayBuffer, HerReplayBuffer)

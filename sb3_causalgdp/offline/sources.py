@@ -11,9 +11,9 @@ import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
 
-from sb3_causalgdp.archives import errors_of, existing, load_minari, one_line, read_arrays
 from sb3_causalgdp.offline.extras import OFFLINE_HINT
 from sb3_causalgdp.offline.saved_buffers import SUFFIXES, is_buffer, read_buffer
+from sb3_causalgdp.saving.archives import errors_of, existing, load_minari, one_line, read_arrays
 
 MINARI_ID = re.compile(r"(\w+://[-\w]+/)?[-\w]+(/[-\w]+)*-v\d+")
 ARRAYS = ("observations", "actions", "rewards", "next_observations", "terminations", "truncations")

@@ -13,8 +13,8 @@ from typing import NoReturn
 import gymnasium as gym
 
 from sb3_causalgdp import TrainingDivergedError
-from sb3_causalgdp.archives import FileError
 from sb3_causalgdp.offline.registration import register_environments
+from sb3_causalgdp.saving.archives import FileError
 from sb3_causalgdp.zoo.registration import TRUST_OPTION, ZOO_HINT, SetupError, register
 from sb3_causalgdp.zoo.scripts import surroundings
 

@@ -13,12 +13,12 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
 from sb3_causalgdp import CausalGDP
-from sb3_causalgdp.archives import existing
+from sb3_causalgdp.callbacks.diagnostics import step_divergences
+from sb3_causalgdp.callbacks.pictures import draw_transitions, plot_guidance_strength, policy_input
 from sb3_causalgdp.causal import CausalGraph
 from sb3_causalgdp.causal.plots import plot_causal_graph, plot_history
-from sb3_causalgdp.diagnostics import step_divergences
 from sb3_causalgdp.offline.saved_buffers import SUFFIXES, read_buffer
-from sb3_causalgdp.pictures import draw_transitions, plot_guidance_strength, policy_input
+from sb3_causalgdp.saving.archives import existing
 from sb3_causalgdp.zoo.hyperparameters import constructor_arguments
 from sb3_causalgdp.zoo.run_folder import Evaluations, RunFolder, saved_attributes, saved_versions
 from sb3_causalgdp.zoo.versions import installed_versions

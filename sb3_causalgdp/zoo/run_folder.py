@@ -14,10 +14,10 @@ from stable_baselines3.common.monitor import get_monitor_files
 from stable_baselines3.common.save_util import json_to_data
 
 from sb3_causalgdp import CausalGDP
-from sb3_causalgdp.archives import checked_entries, errors_of, one_line, opened, read_arrays, size_of
 from sb3_causalgdp.causal import CausalGraph
-from sb3_causalgdp.plain import read_json
-from sb3_causalgdp.saved import LARGE, is_pickled, read_plain
+from sb3_causalgdp.saving.archives import checked_entries, errors_of, one_line, opened, read_arrays, size_of
+from sb3_causalgdp.saving.models import LARGE, is_pickled, read_plain
+from sb3_causalgdp.saving.plain import read_json
 from sb3_causalgdp.zoo.settings import read_settings
 
 # RL Zoo's name of a run: the environment, a number, and with --uuid the identifier

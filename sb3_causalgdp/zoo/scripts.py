@@ -11,7 +11,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-from sb3_causalgdp.archives import errors_of, read_pickle
+from sb3_causalgdp.saving.archives import errors_of, read_pickle
 from sb3_causalgdp.zoo.registration import ALGORITHM, ZOO_HINT
 from sb3_causalgdp.zoo.settings import safe_files
 

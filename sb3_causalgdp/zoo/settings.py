@@ -13,7 +13,7 @@ import gymnasium as gym
 import yaml
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecNormalize
 
-from sb3_causalgdp.archives import errors_of, read_pickle
+from sb3_causalgdp.saving.archives import errors_of, read_pickle
 
 TAG = "tag:yaml.org,2002:python/"
 # Modules that a run's settings may name: importing another may run code that came with the run

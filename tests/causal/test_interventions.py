@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from matplotlib.text import Text
 
 from sb3_causalgdp.causal import MaskedWorldModel, StructuralModel, TransitionVariables
-from sb3_causalgdp.causal.effect_plots import plot_action_effects, plot_next_state_effects, plot_reward_effects
+from sb3_causalgdp.causal.plots.effects import plot_action_effects, plot_next_state_effects, plot_reward_effects
 
 VARIABLES = TransitionVariables(("x", "y", "z"), ("u", "v"))
 # s' = A s + B a, r = c s' + e a, in the model's units. u moves x and y, v moves z alone; z has no path to x and y.
@@ -337,7 +337,7 @@ def test_a_dollar_sign_in_a_name_is_a_dollar_sign(tmp_path):
 
 
 def test_missing_matplotlib_says_what_to_install(monkeypatch, linear):
-    monkeypatch.delitem(sys.modules, "sb3_causalgdp.causal.effect_plots")
+    monkeypatch.delitem(sys.modules, "sb3_causalgdp.causal.plots.effects")
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
     with pytest.raises(ImportError, match=r'pip install "sb3_causalgdp\[plots\]"'):
         linear.effect_of_actions(*draw()).plot()

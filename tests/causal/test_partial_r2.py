@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from sb3_causalgdp.causal import StreamingMoments, TransitionVariables, make_discovery
-from sb3_causalgdp.causal.basis import BasisMoments
 from sb3_causalgdp.causal.discovery import DISCOVERY_METHODS, PartialR2, discover, make_statistics
 from sb3_causalgdp.causal.discovery import partial_r2 as module
 from sb3_causalgdp.causal.discovery.partial_r2 import edge_probability
-from sb3_causalgdp.causal.jackknife import jackknife_error
+from sb3_causalgdp.causal.statistics.basis import BasisMoments
+from sb3_causalgdp.causal.statistics.jackknife import jackknife_error
 
 # The benchmarks are not part of the installed package
 sys.path.append(str(Path(__file__).parents[2]))

@@ -13,7 +13,7 @@ from sb3_causalgdp.causal.discovery.partial_r2 import PartialR2
 from sb3_causalgdp.causal.discovery.perturbed import Perturbed
 from sb3_causalgdp.causal.discovery.world_model import WorldModelEffects
 from sb3_causalgdp.causal.graph import CausalGraph
-from sb3_causalgdp.causal.moments import StreamingMoments
+from sb3_causalgdp.causal.statistics.moments import StreamingMoments
 from sb3_causalgdp.causal.variables import TransitionVariables
 
 __all__ = [

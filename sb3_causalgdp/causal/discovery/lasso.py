@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 import torch as th
 
-from sb3_causalgdp.causal.matrices import product
+from sb3_causalgdp.causal.statistics.matrices import product
 
 TARGETS_AT_ONCE = 128  # so that the systems on the supports stay small in memory
 CHECK_EVERY = 20

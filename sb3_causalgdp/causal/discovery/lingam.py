@@ -3,12 +3,12 @@ from typing import Any
 
 import numpy as np
 
-from sb3_causalgdp.causal.degenerate import LimitsFinder, find_degeneracy
 from sb3_causalgdp.causal.discovery.lasso import least_squares_gram
 from sb3_causalgdp.causal.discovery.notears import weight_masks
 from sb3_causalgdp.causal.graph import CausalGraph
-from sb3_causalgdp.causal.moments import StreamingMoments
-from sb3_causalgdp.causal.recent_rows import RecentRows, checked_rows
+from sb3_causalgdp.causal.statistics.degenerate import LimitsFinder, find_degeneracy
+from sb3_causalgdp.causal.statistics.moments import StreamingMoments
+from sb3_causalgdp.causal.statistics.recent_rows import RecentRows, checked_rows
 from sb3_causalgdp.causal.variables import TransitionVariables
 
 LINGAM_HINT = 'the package lingam is needed for direct_lingam: pip install "sb3_causalgdp[lingam]"'

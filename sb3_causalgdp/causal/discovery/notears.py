@@ -4,13 +4,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sb3_causalgdp.causal.degenerate import Degeneracy, LimitsFinder
 from sb3_causalgdp.causal.discovery.acyclic import notears, without_cycles
 from sb3_causalgdp.causal.discovery.lasso import least_squares_gram, newton_steps, solve_lasso_gram
 from sb3_causalgdp.causal.graph import CausalGraph
-from sb3_causalgdp.causal.jackknife import jackknife_error
-from sb3_causalgdp.causal.matrices import product
-from sb3_causalgdp.causal.moments import Moments, StreamingMoments, leave_one_out
+from sb3_causalgdp.causal.statistics.degenerate import Degeneracy, LimitsFinder
+from sb3_causalgdp.causal.statistics.jackknife import jackknife_error
+from sb3_causalgdp.causal.statistics.matrices import product
+from sb3_causalgdp.causal.statistics.moments import Moments, StreamingMoments, leave_one_out
 from sb3_causalgdp.causal.variables import TransitionVariables
 
 TINY = np.finfo(np.float64).tiny

@@ -5,13 +5,13 @@ import numpy as np
 import torch as th
 from scipy.linalg import cho_solve
 
-from sb3_causalgdp.causal.basis import BASES, BasisExpansion, BasisMoments, bytes_needed
-from sb3_causalgdp.causal.degenerate import Degeneracy, LimitsFinder
 from sb3_causalgdp.causal.graph import CausalGraph
-from sb3_causalgdp.causal.grouped import GroupedStatistics
-from sb3_causalgdp.causal.jackknife import jackknife_error
-from sb3_causalgdp.causal.matrices import cholesky_in_place, inverse_in_place, symmetric_product
-from sb3_causalgdp.causal.moments import Moments, Spread, StreamingMoments, leave_one_out
+from sb3_causalgdp.causal.statistics.basis import BASES, BasisExpansion, BasisMoments, bytes_needed
+from sb3_causalgdp.causal.statistics.degenerate import Degeneracy, LimitsFinder
+from sb3_causalgdp.causal.statistics.grouped import GroupedStatistics
+from sb3_causalgdp.causal.statistics.jackknife import jackknife_error
+from sb3_causalgdp.causal.statistics.matrices import cholesky_in_place, inverse_in_place, symmetric_product
+from sb3_causalgdp.causal.statistics.moments import Moments, Spread, StreamingMoments, leave_one_out
 from sb3_causalgdp.causal.variables import TransitionVariables
 
 RIDGE = 1e-6  # of a feature's variance: features of many causes may be almost dependent where the causes are not

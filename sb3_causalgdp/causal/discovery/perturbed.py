@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sb3_causalgdp.causal.graph import CausalGraph
-from sb3_causalgdp.causal.moments import Moments, StreamingMoments
+from sb3_causalgdp.causal.statistics.moments import Moments, StreamingMoments
 from sb3_causalgdp.causal.variables import TransitionVariables
 
 
@@ -15,9 +15,9 @@ class Perturbed:
     Another method with noise on what it sees, to make the graph wrong on purpose: the paper's ablation CausalGDP-WN.
 
     Independent Gaussian noise is added to whatever can be a cause: s_t, a_t and s_{t+1}. For a method that reads
-    :class:`~sb3_causalgdp.causal.moments.StreamingMoments` nothing is drawn: the noise's variance is added to the diagonal of
-    the covariance, which is the limit of infinitely many draws. For other methods noise is drawn as rows arrive, in the
-    standard deviations of the rows up to then.
+    :class:`~sb3_causalgdp.causal.StreamingMoments` nothing is drawn: the noise's variance is added to the diagonal of the
+    covariance, which is the limit of infinitely many draws. For other methods noise is drawn as rows arrive, in the standard
+    deviations of the rows up to then.
 
     :param method: Name of the method, or a callable
     :param noise: Standard deviation of the noise, in standard deviations of each variable, not negative

@@ -4,10 +4,10 @@ from typing import NamedTuple
 import numpy as np
 import torch as th
 
-from sb3_causalgdp.causal.degenerate import LimitsFinder
 from sb3_causalgdp.causal.discovery.partial_r2 import edge_probability
 from sb3_causalgdp.causal.graph import CausalGraph
-from sb3_causalgdp.causal.recent_rows import RecentRows, checked_rows
+from sb3_causalgdp.causal.statistics.degenerate import LimitsFinder
+from sb3_causalgdp.causal.statistics.recent_rows import RecentRows, checked_rows
 from sb3_causalgdp.causal.variables import TransitionVariables
 from sb3_causalgdp.causal.world_model import MaskedWorldModel
 

@@ -1,0 +1,218 @@
+"""The causal world model's schedule: every N environment steps, statistics, discovery, masks."""
+
+import math
+import time
+import warnings
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.type_aliases import PyTorchObs
+
+from sb3_causalgdp.callbacks.diagnostics import guidance_divergence, step_size_bound
+from sb3_causalgdp.causal import min_rows
+
+
+class CausalWorldModelCallback(BaseCallback):
+    """
+    Every ``refresh_freq`` environment steps: feed the new transitions to the discovery's statistics, rediscover the causal
+    graph and write its masks into the world model. In ``pretrain()``, before the first gradient step and every
+    ``refresh_freq`` of them.
+
+    :class:`~sb3_causalgdp.CausalGDP` adds one by itself; passing an own instance to ``learn()`` replaces it. The schedule and
+    the moments live on the model, so that they go on after ``save`` and ``load`` and with ``reset_num_timesteps=False``.
+
+    :param refresh_freq: Environment steps between refreshes, None for the model's ``causal_refresh_freq``
+    :param min_transitions: Transitions that are needed before the first discovery, None for ten for each cause, 200 at least
+    :param diagnostics_batch_size: Replay transitions on which the logged divergence and step-size bound are computed, 0 for
+        none
+    :param verbose: Verbosity level: 1 prints each refresh
+    """
+
+    model: Any  # a CausalGDP, whose file imports this one
+    FEED_ROWS = 10_000
+    FEED_IMAGE_ROWS = 256
+    HISTORY_ROWS = 20_000
+    OFFLINE_HISTORY_ROWS = 100_000
+
+    def __init__(
+        self,
+        refresh_freq: int | None = None,
+        min_transitions: int | None = None,
+        diagnostics_batch_size: int = 64,
+        verbose: int = 0,
+    ) -> None:
+        super().__init__(verbose)
+        if refresh_freq is not None and refresh_freq < 1:
+            raise ValueError(f"refresh_freq must be at least 1 environment step, got {refresh_freq!r}")
+        self.refresh_freq = refresh_freq
+        self.min_transitions = min_transitions
+        self.diagnostics_batch_size = diagnostics_batch_size
+        self._said_too_few = False
+        self._said_step_size = False
+        self._counted_steps = 0
+
+    def _init_callback(self) -> None:
+        self._counted_steps = self.model.num_timesteps
+
+    def _on_training_start(self) -> None:
+        # A resumed call goes on in the middle, between two refreshes
+        if self.model.is_pretraining and self.model._resumed_at_gradient_step != self.model.n_pretrain_steps:
+            self.refresh()
+
+    def _on_step(self) -> bool:
+        # By the model's counter: inside an event callback this is not called at every step
+        self.model._steps_since_refresh += self.model.num_timesteps - self._counted_steps
+        self._counted_steps = self.model.num_timesteps
+        if self.model._steps_since_refresh >= (self.refresh_freq or self.model.causal_refresh_freq):
+            self.refresh()
+        return True
+
+    def refresh(self) -> None:
+        """
+        Feed, discover and write the masks now.
+        """
+        model = self.model
+        start = time.perf_counter()
+        self._feed_statistics()
+        model._steps_since_refresh = 0
+        variables, statistics = model.transition_variables, model.causal_statistics
+        n_causes = variables.n_states + variables.n_actions
+        wanted = max(200, 10 * n_causes) if self.min_transitions is None else self.min_transitions
+        needed = min_rows(model.discovery, variables)
+        # Statistics that started anew hold fewer than they have seen; the weights of a half-life do not add up to an integer
+        n_held = min(statistics.n_samples, getattr(statistics, "count", math.inf))
+        if statistics.n_samples < wanted or n_held < needed - 0.5:
+            self._say_too_few(statistics.n_samples if statistics.n_samples < wanted else round(n_held), max(wanted, needed))
+            return
+        before = model.causal_graph()
+        graph = model.discovery(statistics, variables, model._causal_graph)
+        graph = replace(graph, num_timesteps=int(model.n_environment_steps))
+        model.set_causal_graph(graph)
+        self.logger.record("causal/n_edges", graph.n_edges)
+        self.logger.record("causal/change", graph.change_since(before))
+        self.logger.record("causal/refresh_seconds", time.perf_counter() - start)
+        if self.verbose >= 1:
+            print(f"Causal graph at {model.num_timesteps} steps: {graph.n_edges} edges from {graph.n_samples} transitions")
+        self._log_diagnostics()
+
+    def _say_too_few(self, n_samples: int, needed: int) -> None:
+        if not self._said_too_few:
+            self._said_too_few = True
+            warnings.warn(
+                f"Causal discovery waits: it has {n_samples} transitions and needs {needed}. Until then every edge is open "
+                "and the policy is not guided."
+            )
+
+    def _feed_statistics(self) -> None:
+        """Hand the statistics the rows that they have not seen: preloaded ones first, then those of the replay buffer."""
+        model, statistics = self.model, self.model.causal_statistics
+        if statistics.n_samples == 0:
+            # Not by the buffer's position: one that is just full is at its start again
+            model._fed_offline_position, model._fed_position = 0, -math.inf
+        offline, online = model.offline_buffer, model.replay_buffer
+        if offline is not None:
+            for rows in self._rows_at(offline, np.arange(model._fed_offline_position, offline.size())):
+                statistics.update(rows)
+            model._fed_offline_position, model._fed_marks = offline.size(), list(model._offline_marks)
+        if online is not offline:
+            for rows in self._newest_rows(online, model._stored_position - model._fed_position):
+                statistics.update(rows)
+        model._fed_position = model._stored_position
+        if getattr(statistics, "wants_history", False):
+            statistics.restart()
+            for rows in self._history(offline, online):
+                statistics.refill(rows)
+
+    def _history(self, offline: ReplayBuffer | None, online: ReplayBuffer) -> Iterator[np.ndarray]:
+        if offline is not None:
+            n_rows = min(offline.size(), max(1, self.OFFLINE_HISTORY_ROWS // offline.n_envs))
+            yield from self._rows_at(offline, np.linspace(0, offline.size() - 1, n_rows).astype(np.int64))
+        if online is not offline:
+            yield from self._newest_rows(online, max(1, self.HISTORY_ROWS // online.n_envs))
+
+    def _newest_rows(self, buffer: ReplayBuffer, n_positions: float) -> Iterator[np.ndarray]:
+        """The transitions of at most so many newest positions, oldest first, in parts that fit into memory."""
+        # The full memory efficient buffer has overwritten its oldest observation
+        n_held = buffer.size() - int(buffer.full and buffer.optimize_memory_usage)
+        n_positions = int(min(n_positions, n_held))
+        yield from self._rows_at(buffer, np.arange(buffer.pos - n_positions, buffer.pos) % buffer.buffer_size)
+
+    def _rows_at(self, buffer: ReplayBuffer, positions: np.ndarray) -> Iterator[np.ndarray]:
+        chunk = self.FEED_IMAGE_ROWS if self.model.policy.has_image_state else self.FEED_ROWS
+        positions_per_chunk = max(1, chunk // buffer.n_envs)
+        for first in range(0, len(positions), positions_per_chunk):
+            rows = self._read(buffer, positions[first : first + positions_per_chunk])
+            if len(rows) > 0:
+                yield rows
+
+    def _read(self, buffer: ReplayBuffer, positions: np.ndarray) -> np.ndarray:
+        """One-step transitions as rows ``[s, a, s', r]``, straight from the buffer's arrays, in the environment's units."""
+        if buffer.optimize_memory_usage:
+            next_values, next_positions = buffer.observations, (positions + 1) % buffer.buffer_size
+        else:
+            next_values, next_positions = buffer.next_observations, positions
+        actions = buffer.actions[positions].reshape(len(positions) * buffer.n_envs, -1)
+        rows = self.model.transition_variables.stack(
+            self._states(buffer.observations, positions),
+            actions,
+            self._states(next_values, next_positions),
+            buffer.rewards[positions].reshape(-1),
+        )
+        if buffer.optimize_memory_usage:
+            # This buffer does not keep the last observation of an episode
+            rows = rows[buffer.dones[positions].reshape(-1) == 0.0]
+        return rows
+
+    def _states(self, observations: np.ndarray | dict[str, np.ndarray], positions: np.ndarray) -> np.ndarray:
+        policy = self.model.policy
+        # Only networks have to be asked on their device; not all devices know double precision
+        device = self.model.device if policy.has_image_state else "cpu"
+
+        def rows(values: np.ndarray) -> th.Tensor:
+            return th.as_tensor(values[positions].reshape(-1, *values.shape[2:]), device=device)
+
+        if isinstance(observations, dict):
+            return policy.exact_causal_state({key: rows(values) for key, values in observations.items()}).cpu().numpy()
+        return policy.exact_causal_state(rows(observations)).cpu().numpy()
+
+    def _draw_observations(self, buffer: ReplayBuffer) -> PyTorchObs:
+        """A batch as the policy sees it, straight from the arrays: a HER buffer cannot sample before an episode has ended."""
+        rows = np.random.randint(buffer.size(), size=self.diagnostics_batch_size)
+        envs = np.random.randint(buffer.n_envs, size=self.diagnostics_batch_size)
+        drawn: np.ndarray | dict[str, np.ndarray]
+        if isinstance(buffer.observations, dict):
+            drawn = {key: values[rows, envs] for key, values in buffer.observations.items()}
+        else:
+            drawn = buffer.observations[rows, envs]
+        drawn = buffer._normalize_obs(drawn, self.model._vec_normalize_env)
+        if isinstance(drawn, dict):
+            return {key: buffer.to_torch(values) for key, values in drawn.items()}
+        return buffer.to_torch(drawn)
+
+    def _log_diagnostics(self) -> None:
+        model = self.model
+        if self.diagnostics_batch_size == 0 or not model.policy.is_guided:
+            return
+        buffer = model.replay_buffer if model.replay_buffer.size() > 0 else model.offline_buffer
+        if buffer is None:
+            # A loaded model starts with an empty buffer
+            return
+        observations = self._draw_observations(buffer)
+        model.policy.set_training_mode(False)
+        self.logger.record("guidance/kl", guidance_divergence(model.policy, observations))
+        bound = step_size_bound(model.policy, observations)
+        self.logger.record("guidance/step_size", bound.step_size)
+        self.logger.record("guidance/step_size_bound", bound.bound)
+        self.logger.record("guidance/lipschitz", bound.guidance_lipschitz)
+        too_steep = bound.guidance_exceeds and not model.policy.guidance_rule.samples_a_posterior
+        if too_steep and not self._said_step_size:
+            self._said_step_size = True
+            warnings.warn(
+                f"The guidance is too steep for the sampler's step of {bound.step_size:.3g} (Proposition 1): it alone allows "
+                f"{bound.guidance_bound:.3g}. Use guidance='posterior', a guidance_scale up to 1, or more diffusion_steps."
+            )

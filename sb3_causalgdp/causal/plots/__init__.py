@@ -1,0 +1,15 @@
+"""Pictures of causal graphs; needs matplotlib and networkx."""
+
+from sb3_causalgdp.causal.graph import PLOTS_HINT
+
+try:
+    from sb3_causalgdp.causal.plots.graphs import plot_causal_graph
+    from sb3_causalgdp.causal.plots.heat_maps import plot_heat_map
+    from sb3_causalgdp.causal.plots.history import animate_history, plot_history
+    from sb3_causalgdp.causal.plots.layered_graphs import plot_graph
+except ImportError as error:
+    if (error.name or "").startswith("sb3_causalgdp"):
+        raise
+    raise ImportError(PLOTS_HINT) from error
+
+__all__ = ["animate_history", "plot_causal_graph", "plot_graph", "plot_heat_map", "plot_history"]

@@ -1,0 +1,1 @@
+"""What discovery keeps of transitions, and the linear algebra on it."""

@@ -1,0 +1,1 @@
+"""What is in files, and how files of strangers are read."""

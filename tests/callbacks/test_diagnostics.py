@@ -1,0 +1,92 @@
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+
+from sb3_causalgdp import MlpPolicy
+from sb3_causalgdp.callbacks.diagnostics import guidance_divergence, step_size_bound
+
+
+def make_policy(**kwargs):
+    th.manual_seed(0)
+    observation_space = spaces.Box(-1.0, 1.0, (3,), np.float32)
+    action_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
+    return MlpPolicy(observation_space, action_space, lambda _: 1e-3, net_arch=[16], world_model_net_arch=[16], **kwargs)
+
+
+@pytest.fixture
+def observations():
+    return th.rand(16, 3, generator=th.Generator().manual_seed(0)) * 2 - 1
+
+
+def divergence(observations, **kwargs):
+    policy = make_policy(**kwargs)
+    th.manual_seed(1)
+    return guidance_divergence(policy, observations)
+
+
+def bound(observations, **kwargs):
+    delta = kwargs.pop("delta", 1.0)
+    policy = make_policy(**kwargs)
+    th.manual_seed(1)
+    return step_size_bound(policy, observations, delta)
+
+
+@pytest.mark.parametrize("guidance", ["posterior", "score", "normalized"])
+def test_divergence_grows_from_nothing_with_the_scale(guidance, observations):
+    values = [divergence(observations, guidance=guidance, guidance_scale=scale) for scale in (1e-9, 0.01, 0.1, 1.0)]
+    assert 0.0 <= values[0] < 1e-10
+    assert values == sorted(values) and values[1] < values[3]
+    # Quadratic in the shift, for small ones
+    assert values[2] == pytest.approx(100 * values[1], rel=0.5)
+
+
+def test_divergence_is_the_sum_over_all_steps(observations):
+    scales = np.full(5, 0.01)
+    whole = divergence(observations, guidance_scale=list(scales))
+    parts = [divergence(observations, guidance_scale=list(scales * (np.arange(5) == step))) for step in range(5)]
+    assert all(0.0 < part < whole for part in parts)
+    assert sum(parts) == pytest.approx(whole, rel=0.2)
+
+
+def test_divergence_leaves_no_gradient(observations):
+    policy = make_policy()
+    guidance_divergence(policy, observations)
+    step_size_bound(policy, observations)
+    assert all(parameter.grad is None for parameter in policy.parameters())
+
+
+@pytest.mark.parametrize("guidance", ["posterior", "score"])
+def test_step_size_bound_shrinks_with_the_scale(guidance, observations):
+    bounds = [bound(observations, guidance=guidance, guidance_scale=scale) for scale in (0.01, 1.0, 100.0)]
+    assert bounds[0].bound > bounds[1].bound > bounds[2].bound > 0.0
+    # The guidance's share is inversely proportional to its scale
+    for one, next_one in pairwise(bounds):
+        assert next_one.guidance_bound == pytest.approx(one.guidance_bound / 100.0, rel=0.05)
+        assert next_one.guidance_lipschitz == pytest.approx(100.0 * one.guidance_lipschitz, rel=0.05)
+    assert all(one.bound < one.guidance_bound for one in bounds)
+
+
+def test_bound_is_proportional_to_delta(observations):
+    half, whole = bound(observations, delta=0.5), bound(observations, delta=1.0)
+    assert half.bound == pytest.approx(0.5 * whole.bound)
+    assert half.guidance_bound == pytest.approx(0.5 * whole.guidance_bound)
+
+
+@pytest.mark.parametrize("n_steps", [1, 5, 10])
+def test_step_size_is_one_over_the_number_of_steps(n_steps, observations):
+    assert bound(observations, diffusion_steps=n_steps).step_size == pytest.approx(1.0 / n_steps)
+
+
+def test_a_huge_plain_score_exceeds_the_bound_and_a_tiny_one_does_not(observations):
+    assert bound(observations, guidance="score", guidance_scale=1e6).guidance_exceeds
+    assert not bound(observations, guidance="score", guidance_scale=1e-6).guidance_exceeds
+
+
+def test_posterior_guidance_is_less_steep_than_the_plain_score(observations):
+    steep = {"state_guidance_scale": 1e4, "outcome_guidance_scale": 1e4}
+    score, posterior = (bound(observations, guidance=name, **steep) for name in ("score", "posterior"))
+    assert score.guidance_lipschitz > 10 * posterior.guidance_lipschitz
+    assert score.guidance_exceeds

@@ -1,0 +1,37 @@
+import importlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+from stable_baselines3.common.env_util import make_vec_env
+
+from sb3_causalgdp import CausalGDP
+from sb3_causalgdp.moved import MOVED
+
+DATA = Path(__file__).parent / "data"
+# Of the version in which both files were written, for this observation
+OBSERVATION, ACTION = np.array([[0.5, 0.5, 1.0]], dtype=np.float32), 1.1722972
+
+
+@pytest.mark.parametrize("old", MOVED)
+def test_old_names_of_modules_are_the_new_modules_and_say_so(old):
+    with pytest.warns(DeprecationWarning, match=f"{old} is {MOVED[old]} now"):
+        # Outside of sys.modules, where another test may have put it
+        module = importlib.util.find_spec(old).loader.create_module(importlib.util.find_spec(old))
+    assert module is importlib.import_module(MOVED[old])
+    assert module.__spec__.name == MOVED[old]
+
+
+def test_a_model_that_was_saved_under_old_names_loads():
+    model = CausalGDP.load(DATA / "model_of_0_1.zip")
+    assert model.predict(OBSERVATION, deterministic=True)[0] == pytest.approx(ACTION, abs=1e-4)
+    assert model.causal_graph().num_timesteps == model.causal_graph_history[-1].num_timesteps == 500
+    found = model.discovery(model.causal_statistics, model.transition_variables)
+    np.testing.assert_allclose(found.state_to_state, model.causal_graph().state_to_state, atol=1e-5)
+
+
+def test_a_training_whose_checkpoint_has_old_names_goes_on():
+    model = CausalGDP.resume(DATA / "checkpoint_of_0_1.zip", make_vec_env("Pendulum-v1"))
+    n_updates = model._n_updates
+    model.learn(20, reset_num_timesteps=False)
+    assert model.num_timesteps == 540 and model._n_updates == n_updates + 20
