@@ -300,7 +300,7 @@ CONSTRUCTOR_ARGUMENTS: dict[str, Kind] = {
     "replay_buffer_class": subclass(ReplayBuffer, "a subclass of ReplayBuffer") | NONE,
     "replay_buffer_kwargs": KEYWORDS | NONE,
     "optimize_memory_usage": FLAG,
-    "n_steps": integer(1, MOST_CANDIDATES),
+    "n_steps": integer(1, MOST_CANDIDATES) | choice(["auto"]),
     "critic_learning_rate": RATE | NONE,
     "world_model_learning_rate": RATE,
     "eta": WEIGHT,
@@ -310,6 +310,8 @@ CONSTRUCTOR_ARGUMENTS: dict[str, Kind] = {
     "bound_penalty": WEIGHT,
     "policy_delay": STEPS,
     "world_model_delay": STEPS,
+    "target_policy_noise": number(0.0, LARGEST_NOISE),
+    "target_noise_clip": number(0.0, LARGEST_NOISE),
     "max_q_backup": FLAG,
     "max_grad_norm": number(0.0, LARGEST_NUMBER, above=True) | NONE,
     **SHARED_ARGUMENTS,
@@ -352,6 +354,7 @@ POLICY_ARGUMENTS: dict[str, Kind] = {
     "optimizer_kwargs": KEYWORDS | NONE,
     "n_critics": integer(1, MOST_CRITICS),
     "critic_layer_norm": FLAG,
+    "normalize_observations": FLAG,
     "share_features_extractor": FLAG,
     "world_model_net_arch": sequence(
         integer(1, WIDEST_LAYER), f"a list of 1 to {MOST_LAYERS} equal layer sizes, like [128, 128],", shortest=1, equal=True

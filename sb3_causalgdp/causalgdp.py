@@ -115,7 +115,8 @@ class CausalGDP(OfflineToOnlineAlgorithm):
     :param replay_buffer_kwargs: Keyword arguments to pass to the replay buffer on creation.
     :param optimize_memory_usage: Enable a memory efficient variant of the replay buffer at a cost of more complexity.
     :param n_steps: When n_step > 1, uses n-step return (with the NStepReplayBuffer) when updating the Q-value network; the
-        world model still learns from single steps.
+        world model still learns from single steps. ``"auto"`` is 3 where SB3 has such a buffer, and 1 for Dict observations,
+        a ``replay_buffer_class``, ``optimize_memory_usage`` and an ``offline_dataset``
     :param critic_learning_rate: Learning rate of the critics, a number or a schedule; None takes ``learning_rate``
     :param world_model_learning_rate: Learning rate of the world model, a number or a schedule
     :param eta: Weight of the Q term in the policy loss (the paper's table: 0.005 to 5)
@@ -131,6 +132,8 @@ class CausalGDP(OfflineToOnlineAlgorithm):
     :param policy_delay: The actor is updated once every so many gradient steps, as in TD3. Where a call of :meth:`train` makes
         many steps, the TD targets of those from one update of the actor to the next are computed at once
     :param world_model_delay: The world model is updated once every so many gradient steps
+    :param target_policy_noise: Standard deviation of the noise on the actions of TD targets, as in TD3
+    :param target_noise_clip: Limit of its absolute value
     :param max_q_backup: Whether the TD target takes the best of ten sampled actions (Diffusion-QL, for AntMaze)
     :param max_grad_norm: Bound of the gradient norms of the actor and of the critics, None for no bound
     :param diffusion_steps: Number of diffusion steps K
@@ -205,6 +208,7 @@ class CausalGDP(OfflineToOnlineAlgorithm):
     RUNNING_WEIGHT = 0.01
     REWARD_QUANTILE = 0.99
     N_BACKUP_ACTIONS = 10
+    AUTO_N_STEPS = 3
     GRAPHS_IN_HISTORY = 32
     MOST_ROWS_PER_DRAW = 16_384
     MOST_RESTORES = 3
@@ -213,7 +217,7 @@ class CausalGDP(OfflineToOnlineAlgorithm):
         self,
         policy: str | type[CausalGDPPolicy],
         env: GymEnv | str,
-        learning_rate: float | Schedule = 1e-3,
+        learning_rate: float | Schedule = 3e-4,
         buffer_size: int = 1_000_000,  # 1e6
         learning_starts: int = 100,
         batch_size: int = 256,
@@ -225,7 +229,7 @@ class CausalGDP(OfflineToOnlineAlgorithm):
         replay_buffer_class: type[ReplayBuffer] | None = None,
         replay_buffer_kwargs: dict[str, Any] | None = None,
         optimize_memory_usage: bool = False,
-        n_steps: int = 1,
+        n_steps: int | str = "auto",
         critic_learning_rate: float | Schedule | None = None,
         world_model_learning_rate: float | Schedule = 1e-3,
         eta: float = 1.0,
@@ -235,6 +239,8 @@ class CausalGDP(OfflineToOnlineAlgorithm):
         bound_penalty: float = 0.1,
         policy_delay: int = 2,
         world_model_delay: int = 2,
+        target_policy_noise: float = 0.2,
+        target_noise_clip: float = 0.5,
         max_q_backup: bool = False,
         max_grad_norm: float | None = None,
         diffusion_steps: int = 5,
@@ -291,7 +297,7 @@ class CausalGDP(OfflineToOnlineAlgorithm):
             replay_buffer_class=replay_buffer_class,
             replay_buffer_kwargs=replay_buffer_kwargs,
             optimize_memory_usage=optimize_memory_usage,
-            n_steps=n_steps,
+            n_steps=1 if n_steps == "auto" else n_steps,  # type: ignore[arg-type]
             policy_kwargs=policy_kwargs,
             stats_window_size=stats_window_size,
             tensorboard_log=tensorboard_log,
@@ -306,6 +312,7 @@ class CausalGDP(OfflineToOnlineAlgorithm):
             offline_fraction=offline_fraction,
             reward_transform=reward_transform,
         )
+        self._n_steps_wanted = n_steps
         self.critic_learning_rate = critic_learning_rate
         self.world_model_learning_rate = world_model_learning_rate
         self.eta = eta
@@ -315,6 +322,8 @@ class CausalGDP(OfflineToOnlineAlgorithm):
         self.bound_penalty = bound_penalty
         self.policy_delay = policy_delay
         self.world_model_delay = world_model_delay
+        self.target_policy_noise = target_policy_noise
+        self.target_noise_clip = target_noise_clip
         self.max_q_backup = max_q_backup
         self.max_grad_norm = max_grad_norm
         self.diffusion_steps = diffusion_steps
@@ -359,6 +368,7 @@ class CausalGDP(OfflineToOnlineAlgorithm):
             self._check_cuda_graph()
 
     def _setup_model(self) -> None:
+        self._choose_n_steps()
         self._check_arguments()
         policy_kwargs = self.policy_kwargs
         # The policy gets our arguments too, but they must not enter the user's own dictionary
@@ -381,6 +391,16 @@ class CausalGDP(OfflineToOnlineAlgorithm):
         self.critic_batch_norm_stats = get_parameters_by_name(self.critic, ["running_"])
         self.actor_batch_norm_stats_target = get_parameters_by_name(self.actor_target, ["running_"])
         self.critic_batch_norm_stats_target = get_parameters_by_name(self.critic_target, ["running_"])
+
+    def _choose_n_steps(self) -> None:
+        if self._n_steps_wanted != "auto" or self.replay_buffer_class is NStepReplayBuffer:
+            return  # the latter where it was chosen, and saved
+        is_dict = isinstance(self.observation_space, spaces.Dict)
+        plain = (
+            is_dict or self.optimize_memory_usage or self.replay_buffer_class is not None or self.offline_dataset is not None
+        )
+        fits = self.buffer_size // self.n_envs >= self.AUTO_N_STEPS
+        self.n_steps = self.AUTO_N_STEPS if fits and not plain else 1
 
     def _setup_compile(self) -> None:
         for name in COMPILED:
@@ -825,9 +845,17 @@ class CausalGDP(OfflineToOnlineAlgorithm):
             actor_features = self.actor_target.features(next_observations).repeat_interleave(n_actions, dim=0)
             next_actions = self.actor_target.sample(actor_features)
             critic_features = self.critic_target.extract_features(next_observations, self.critic_target.features_extractor)
-            next_q_values = q_values(self.critic_target, critic_features.repeat_interleave(n_actions, dim=0), next_actions)
+            smoothed = self._smoothed(next_actions)
+            next_q_values = q_values(self.critic_target, critic_features.repeat_interleave(n_actions, dim=0), smoothed)
             target = td_target(next_q_values, replay_data.rewards, replay_data.dones, discounts, n_actions)
         return next_actions[::n_actions], target
+
+    def _smoothed(self, actions: th.Tensor) -> th.Tensor:
+        """Actions with clipped noise, so that no narrow peak of Q becomes a target (TD3)."""
+        if self.target_policy_noise == 0.0:
+            return actions
+        noise = self.target_policy_noise * th.randn_like(actions)
+        return (actions + noise.clamp(-self.target_noise_clip, self.target_noise_clip)).clamp(-1.0, 1.0)
 
     def _update_world_model(self, transitions, running_weight: float) -> dict[str, th.Tensor]:
         state = self.policy.causal_state(transitions.observations)
@@ -839,6 +867,7 @@ class CausalGDP(OfflineToOnlineAlgorithm):
         known = 1.0 - transitions.dones.flatten() if self.optimize_memory_usage else None
         transition, reward, gradients = self._world_model_gradients(state, transitions.actions, next_state, rewards, known)
         self._step(self.world_model, gradients)
+        self.policy.update_observation_statistics()
         return {"world_model_transition_loss": transition, "world_model_reward_loss": reward}
 
     def _world_model_gradients(

@@ -33,6 +33,7 @@ from sb3_causalgdp.checks import first_not_finite_index, fits_float32, is_finite
 from sb3_causalgdp.diffusion import Guidance, GuidanceRule, MLPDenoiser, NoiseSchedule, sample
 from sb3_causalgdp.diffusion.samplers import bind, check_sampler
 from sb3_causalgdp.divergence import TrainingDivergedError, first_not_finite
+from sb3_causalgdp.extractors import StandardizedExtractor
 from sb3_causalgdp.files import saved_when_done
 from sb3_causalgdp.saving.archives import TRUST, FileError, errors_of, named, opened, size_of
 from sb3_causalgdp.saving.models import BLOCK, CONTENT, KNOWN, check_limits, check_tensor_file, plain_entries
@@ -270,7 +271,9 @@ class CausalGDPPolicy(BasePolicy):
     :param optimizer_kwargs: Its keyword arguments, without the learning rate
     :param n_critics: Number of critics
     :param critic_layer_norm: Whether the critics' hidden layers have layer normalisation, which bounds what they say of
-        actions that the data does not hold (RLPD, Ball et al., 2023, section 4.2): for offline data with ``learn()`` after it
+        actions that the data does not hold (RLPD, Ball et al., 2023, section 4.2)
+    :param normalize_observations: Whether actor and critics see observations in the standard deviations that the world model
+        measures while it trains; where there are images or an extractor of your own, they see them as they are
     :param share_features_extractor: Whether actor and critics share one features extractor
     :param world_model_net_arch: Hidden layers of the world model, all of one size, ``[128, 128]`` by default
     :param diffusion_steps: Number of diffusion steps K
@@ -311,7 +314,8 @@ class CausalGDPPolicy(BasePolicy):
         optimizer_class: type[th.optim.Optimizer] = th.optim.Adam,
         optimizer_kwargs: dict[str, Any] | None = None,
         n_critics: int = 2,
-        critic_layer_norm: bool = False,
+        critic_layer_norm: bool = True,
+        normalize_observations: bool = True,
         share_features_extractor: bool = False,
         world_model_net_arch: list[int] | None = None,
         diffusion_steps: int = 5,
@@ -360,10 +364,11 @@ class CausalGDPPolicy(BasePolicy):
         self.exploration_noise = exploration_noise
         self.discount = discount
 
-        self.net_arch = [256, 256] if net_arch is None else net_arch
+        self.net_arch = [256, 256, 256] if net_arch is None else net_arch
         self.activation_fn = activation_class(activation_fn)
         self.n_critics = n_critics
         self.critic_layer_norm = critic_layer_norm
+        self.normalize_observations = normalize_observations
         self.share_features_extractor = share_features_extractor
         self.world_model_net_arch = world_model_net_arch
         actor_arch, critic_arch = get_actor_critic_arch(self.net_arch)
@@ -391,6 +396,11 @@ class CausalGDPPolicy(BasePolicy):
         self._build(lr_schedule)
 
     def _build(self, lr_schedule: Schedule) -> None:
+        # Here, because a compiler cannot see through flatdim()
+        self.leaf_sizes = [spaces.flatdim(space) for space in _leaf_spaces(self.observation_space)]
+        self.has_image_state = any(
+            is_image_space(space, normalized_image=not self.normalize_images) for space in _leaf_spaces(self.observation_space)
+        )
         self._acting: NumpyActing | None = None
         self.register_buffer("reward_target", th.zeros(()))
         self.register_buffer("return_std", th.ones(()))
@@ -405,11 +415,6 @@ class CausalGDPPolicy(BasePolicy):
         self.critic_target.load_state_dict(self.critic.state_dict())
         self._check_guidance_steps()
 
-        # Here, because a compiler cannot see through flatdim()
-        self.leaf_sizes = [spaces.flatdim(space) for space in _leaf_spaces(self.observation_space)]
-        self.has_image_state = any(
-            is_image_space(space, normalized_image=not self.normalize_images) for space in _leaf_spaces(self.observation_space)
-        )
         self.world_model = MaskedWorldModel(self._state_dim(), self.actor.action_dim, self.world_model_net_arch)
         self.register_buffer("candidate_noise", self._fixed_candidate_noise(), persistent=False)
 
@@ -451,6 +456,26 @@ class CausalGDPPolicy(BasePolicy):
     def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> Critic:
         return Critic(**self._update_features_extractor(self.critic_kwargs, features_extractor)).to(self.device)
 
+    def make_features_extractor(self) -> BaseFeaturesExtractor:
+        extractor = super().make_features_extractor()
+        is_covered = self.normalize_observations and not self.has_image_state
+        if is_covered and StandardizedExtractor.covers(extractor, sum(self.leaf_sizes)):
+            return StandardizedExtractor(extractor).to(self.device)
+        return extractor
+
+    @th.no_grad()
+    def update_observation_statistics(self) -> None:
+        """Let actor, critics and their targets see observations by what the world model knows of them by now."""
+        networks = (self.actor, self.actor_target, self.critic, self.critic_target)
+        extractors = [network.features_extractor for network in networks]
+        standardized = [one for one in extractors if isinstance(one, StandardizedExtractor)]
+        if standardized:
+            mean, inverse_std = self.world_model.state_mean, 1.0 / self.world_model.state_std
+            th._foreach_copy_(
+                [tensor for one in standardized for tensor in (one.mean, one.inverse_std)],
+                [mean, inverse_std] * len(standardized),
+            )
+
     def first_not_finite(self, state_dict: Mapping[str, th.Tensor] | None = None) -> tuple[str, float] | None:
         """
         :param state_dict: Tensors by their names in this policy, None for its own
@@ -472,6 +497,7 @@ class CausalGDPPolicy(BasePolicy):
             optimizer_kwargs=self.optimizer_kwargs,
             n_critics=self.n_critics,
             critic_layer_norm=self.critic_layer_norm,
+            normalize_observations=self.normalize_observations,
             share_features_extractor=self.share_features_extractor,
             world_model_net_arch=self.world_model_net_arch,
             lr_schedule=self._dummy_schedule,  # not needed for loading the policy alone

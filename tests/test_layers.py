@@ -20,7 +20,7 @@ LAYERS = [
     {"policies"},
     {"acceleration.acting", "arguments", "saving.models"},
     {"causal", "offline", "diffusion"},
-    {"checks", "divergence", "files", "acceleration.products", "acceleration.activations", "saving.plain", "saving.archives"},
+    {"checks", "divergence", "files", "acceleration.products", "acceleration.activations", "saving.plain", "saving.archives", "extractors"},
     {"saving.numpy_pickles", "acceleration", "saving", "moved"},
 ]
 WITHOUT_SB3 = {

@@ -24,6 +24,7 @@ from sb3_causalgdp.acceleration.activations import fast
 from sb3_causalgdp.causal.world_model import MaskedBlocks, MaskedWorldModel
 from sb3_causalgdp.diffusion import GuidanceRule, MLPDenoiser, NoiseSchedule
 from sb3_causalgdp.diffusion.samplers import transition_weights
+from sb3_causalgdp.extractors import StandardizedExtractor
 
 Policy = Any  # a CausalGDPPolicy, whose file imports this one
 
@@ -75,6 +76,9 @@ ACTIVATIONS: dict[type[nn.Module], Activation] = {
     nn.ReLU: Activation(lambda x: np.maximum(x, _ZERO), lambda x, y: y > _ZERO),
     nn.Tanh: Activation(np.tanh, lambda x, y: _ONE - y * y),
     nn.Mish: Activation(lambda x: x * _tanh_of_softplus(x), _mish_derivative),
+    nn.ELU: Activation(
+        lambda x: np.where(x > _ZERO, x, np.expm1(np.minimum(x, _ZERO))), lambda x, y: np.where(x > _ZERO, _ONE, y + _ONE)
+    ),
     nn.SiLU: Activation(lambda x: x * _sigmoid(x), _silu_derivative),
 }
 
@@ -253,6 +257,36 @@ class _Denoiser:
         step = self.steps[self.adapting_step]
         noisy = step.signal * action
         return _clip(step.clean(noisy, self.predict_noise(noisy, self.bind(features, time_part[self.adapting_step]))))
+
+
+def _shows_vectors(extractor: nn.Module) -> bool:
+    if type(extractor) is StandardizedExtractor:
+        extractor = extractor.extractor
+    return type(extractor) is FlattenExtractor
+
+
+class _Features:
+    """What actor and critics see of states of shape ``(n, batch)``; their statistics are the same."""
+
+    def __init__(self, policy: Policy) -> None:
+        extractor = policy.critic_target.features_extractor
+        self.is_plain = type(extractor) is FlattenExtractor
+        if not self.is_plain:
+            self.mean, self.inverse_std = _view(extractor.mean)[:, None], _view(extractor.inverse_std)[:, None]
+            self.bounds = _constant(-extractor.BOUND), _constant(extractor.BOUND)
+
+    def __call__(self, state: np.ndarray) -> np.ndarray:
+        if self.is_plain:
+            return state
+        standardized = state - self.mean
+        standardized *= self.inverse_std
+        return _clip(standardized, *self.bounds)
+
+    def backward(self, gradient: np.ndarray, features: np.ndarray) -> np.ndarray:
+        """From the gradient by the features, the one by the states."""
+        if self.is_plain:
+            return gradient
+        return gradient * self.inverse_std * (np.abs(features) <= self.bounds[1])
 
 
 class _Hidden(NamedTuple):
@@ -506,6 +540,7 @@ class NumpyActing:
         self._copy = HostCopy(policy) if copies or (copies is None and policy.device.type != "cpu") else None
         near = policy if self._copy is None else self._copy.policy
         self.denoiser = _Denoiser(near)
+        self.features = _Features(near)
         self.critics = _Critics(near)
         self.world_model = _WorldModel(near.world_model)
         self.return_std, self.reward_target = _view(near.return_std), _view(near.reward_target)
@@ -542,8 +577,8 @@ class NumpyActing:
             policy.device.type in ("cpu", "cuda")
             and type(policy.observation_space) is spaces.Box
             and not policy.has_image_state
-            and type(policy.actor.features_extractor) is FlattenExtractor
-            and type(policy.critic_target.features_extractor) is FlattenExtractor
+            and _shows_vectors(policy.actor.features_extractor)
+            and _shows_vectors(policy.critic_target.features_extractor)
             and type(policy.actor.denoiser) is MLPDenoiser
             and activation in ACTIVATIONS
             and all(_has_plain_layers(network, activation) for network in networks)
@@ -551,10 +586,10 @@ class NumpyActing:
             and (rule is None or not rule.needs_jacobian)
         )
 
-    def __call__(self, policy: Policy, features: np.ndarray, noise: np.ndarray, guided: bool) -> np.ndarray:
+    def __call__(self, policy: Policy, state: np.ndarray, noise: np.ndarray, guided: bool) -> np.ndarray:
         """
         :param policy: The policy, for its settings
-        :param features: The observations, float32, shape ``(batch, n)``
+        :param state: The observations, float32, shape ``(batch, n)``
         :param noise: Noise of the candidates, shape ``(K, batch * n_action_candidates, d)``
         :param guided: Whether the guidance is on
         :return: Actions in [-1, 1], shape ``(batch, d)``
@@ -563,27 +598,28 @@ class NumpyActing:
             self._copy.refresh()
         # On products this small, several threads of numpy's library mostly wait for each other: ten times the time
         if all(library.num_threads == 1 for library in self._blas.lib_controllers):
-            return self._act(policy, features, noise, guided)
+            return self._act(policy, state, noise, guided)
         with self._blas.limit(limits=1):
-            return self._act(policy, features, noise, guided)
+            return self._act(policy, state, noise, guided)
 
-    def _act(self, policy: Policy, features: np.ndarray, noise: np.ndarray, guided: bool) -> np.ndarray:
+    def _act(self, policy: Policy, state: np.ndarray, noise: np.ndarray, guided: bool) -> np.ndarray:
         n_candidates = policy.n_action_candidates
+        features = self.features(state.T)
         time_part = self.denoiser.time_part()
-        bound = self.denoiser.bind(features.T, time_part)
+        bound = self.denoiser.bind(features, time_part)
         noise = noise.transpose(0, 2, 1)
         repeated = bound if n_candidates == 1 else np.repeat(bound, n_candidates, axis=2)
         start, scaled_noise = noise[0], self.denoiser.scaled(noise)
         first_prediction = self.denoiser.predict_noise(start, repeated[-1])
         action = self.denoiser.sample(repeated, start, scaled_noise, first_prediction).T
         if n_candidates > 1:
-            values = self.critics.values(features.T, action.T, n_candidates).reshape(-1, n_candidates)
+            values = self.critics.values(features, action.T, n_candidates).reshape(-1, n_candidates)
             best = np.arange(0, len(action), n_candidates) + values.argmax(axis=1)
             action, start, first_prediction = action[best], start[:, best], first_prediction[:, best]
             scaled_noise = scaled_noise[:, :, best]
         if guided:
             assert self.rule is not None
-            shift = self.rule.shift(action, *self._local_model(policy, features, action, time_part))
+            shift = self.rule.shift(action, *self._local_model(policy, state, action, time_part))
             action = self.denoiser.sample(bound, start, scaled_noise, first_prediction, shift).T
         return np.ascontiguousarray(action)
 
@@ -609,5 +645,6 @@ class NumpyActing:
         return gradient, curvature
 
     def _value_gradient(self, response: dict[str, np.ndarray], action: np.ndarray, time_part: np.ndarray) -> np.ndarray:
-        next_state = response["next_state"].T
-        return self.critics.gradient(next_state, self.denoiser.adapt(next_state, action.T, time_part)).T
+        features = self.features(response["next_state"].T)
+        gradient = self.critics.gradient(features, self.denoiser.adapt(features, action.T, time_part))
+        return self.features.backward(gradient, features).T

@@ -1,0 +1,46 @@
+"""Features of observations in standard deviations, as the world model measures them, so that nobody needs VecNormalize."""
+
+import torch as th
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, CombinedExtractor, FlattenExtractor
+from stable_baselines3.common.type_aliases import PyTorchObs
+
+
+class StandardizedExtractor(BaseFeaturesExtractor):
+    """
+    The features of another extractor minus their means, in standard deviations, within [-10, 10]. Until
+    :meth:`set_statistics` is called they are as they are.
+
+    :param extractor: Gives the observation flattened
+    """
+
+    BOUND = 10.0
+
+    mean: th.Tensor
+    inverse_std: th.Tensor
+
+    def __init__(self, extractor: BaseFeaturesExtractor) -> None:
+        super().__init__(extractor._observation_space, extractor.features_dim)
+        self.extractor = extractor
+        self.register_buffer("mean", th.zeros(extractor.features_dim))
+        self.register_buffer("inverse_std", th.ones(extractor.features_dim))
+
+    @staticmethod
+    def covers(extractor: BaseFeaturesExtractor, state_dim: int) -> bool:
+        """
+        :param extractor: A features extractor
+        :param state_dim: Number of state variables of the world model
+        :return: Whether its features are these variables
+        """
+        return type(extractor) in (FlattenExtractor, CombinedExtractor) and extractor.features_dim == state_dim
+
+    def set_statistics(self, mean: th.Tensor, inverse_std: th.Tensor) -> None:
+        """
+        :param mean: Of the features, shape ``(features_dim,)``
+        :param inverse_std: One over their standard deviations, shape ``(features_dim,)``
+        """
+        self.mean.copy_(mean)
+        self.inverse_std.copy_(inverse_std)
+
+    def forward(self, observations: PyTorchObs) -> th.Tensor:
+        standardized = (self.extractor(observations) - self.mean) * self.inverse_std
+        return standardized.clamp(-self.BOUND, self.BOUND)
