@@ -26,6 +26,7 @@ from sb3_causalgdp.diffusion.schedules import NOISE_SCHEDULES
 from sb3_causalgdp.offline.rewards import REWARD_TRANSFORMS
 
 ACTOR_UPDATES = ("one_step", "chain")
+PREDICTION_TYPES = ("noise", "velocity")
 Q_SCALES = ("value", "advantage")
 GUIDANCE_TARGETS = ("return", "reward")
 
@@ -355,6 +356,7 @@ POLICY_ARGUMENTS: dict[str, Kind] = {
     "n_critics": integer(1, MOST_CRITICS),
     "critic_layer_norm": FLAG,
     "normalize_observations": FLAG,
+    "prediction_type": choice(PREDICTION_TYPES),
     "share_features_extractor": FLAG,
     "world_model_net_arch": sequence(
         integer(1, WIDEST_LAYER), f"a list of 1 to {MOST_LAYERS} equal layer sizes, like [128, 128],", shortest=1, equal=True

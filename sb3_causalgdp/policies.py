@@ -141,6 +141,8 @@ class DiffusionActor(_PickledAlone, BasePolicy):
     :param noise_schedule: ``vp``, ``linear`` or ``cosine``
     :param sampler: ``ddpm`` or ``ddim``
     :param ddim_eta: Noise of DDIM, in [0, 1]
+    :param prediction_type: What the denoiser predicts: ``noise``, or ``velocity``, see
+        :class:`~sb3_causalgdp.diffusion.MLPDenoiser`
     """
 
     # Noise's share of the variance from which an action is adapted to a state near by
@@ -159,6 +161,7 @@ class DiffusionActor(_PickledAlone, BasePolicy):
         noise_schedule: str = "vp",
         sampler: str = "ddpm",
         ddim_eta: float = 0.0,
+        prediction_type: str = "velocity",
     ) -> None:
         super().__init__(
             observation_space,
@@ -177,7 +180,11 @@ class DiffusionActor(_PickledAlone, BasePolicy):
         self.schedule = NoiseSchedule(noise_schedule, diffusion_steps)
         noisy_enough = (i for i, signal in enumerate(self.schedule.alpha_bar_list) if 1.0 - signal >= self.ADAPTING_NOISE)
         self.adapting_step = next(noisy_enough, self.schedule.n_steps - 1)
-        self.denoiser = MLPDenoiser(self.action_dim, features_dim, diffusion_steps, net_arch, activation_fn)
+        self.prediction_type = prediction_type
+        alpha_bar = self.schedule.alpha_bar if prediction_type == "velocity" else None
+        self.denoiser = MLPDenoiser(
+            self.action_dim, features_dim, diffusion_steps, net_arch, activation_fn, alpha_bar=alpha_bar
+        )
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         data = super()._get_constructor_parameters()
@@ -190,6 +197,7 @@ class DiffusionActor(_PickledAlone, BasePolicy):
             noise_schedule=self.schedule.name,
             sampler=self.sampler,
             ddim_eta=self.ddim_eta,
+            prediction_type=self.prediction_type,
         )
         return data
 
@@ -280,6 +288,8 @@ class CausalGDPPolicy(BasePolicy):
     :param noise_schedule: ``vp``, ``linear`` or ``cosine``
     :param sampler: ``ddpm`` or ``ddim``
     :param ddim_eta: Noise of DDIM, in [0, 1]
+    :param prediction_type: What the denoiser predicts, ``noise`` or ``velocity``, see
+        :class:`~sb3_causalgdp.diffusion.MLPDenoiser`
     :param guidance: ``posterior``, ``score``, ``normalized``, or None for no guidance
     :param guidance_covariance: ``tweedie``, ``isotropic`` or ``unit_gaussian``, see
         :class:`~sb3_causalgdp.diffusion.GuidanceRule`
@@ -322,6 +332,7 @@ class CausalGDPPolicy(BasePolicy):
         noise_schedule: str = "vp",
         sampler: str = "ddpm",
         ddim_eta: float = 0.0,
+        prediction_type: str = "velocity",
         guidance: str | None = "posterior",
         guidance_covariance: str = "unit_gaussian",
         guidance_target: str = "return",
@@ -383,6 +394,7 @@ class CausalGDPPolicy(BasePolicy):
             "noise_schedule": noise_schedule,
             "sampler": sampler,
             "ddim_eta": ddim_eta,
+            "prediction_type": prediction_type,
         }
         self.actor_kwargs = {**shared_kwargs, "net_arch": actor_arch, **self.diffusion_kwargs}
         self.critic_kwargs = {

@@ -155,11 +155,11 @@ def _normalises(module: nn.Module, layer: nn.Linear) -> bool:
 class _ReverseStep:
     """The coefficients of a diffusion step."""
 
-    def __init__(self, schedule: NoiseSchedule, step: int, eta: float) -> None:
+    def __init__(self, schedule: NoiseSchedule, step: int, eta: float, predicts_velocity: bool) -> None:
         alpha_bar = schedule.alpha_bar_list[step]
-        # a0_hat = clean_by_noisy a^k - clean_by_noise eps
-        self.clean_by_noisy = _constant(alpha_bar**-0.5)
-        self.clean_by_noise = _constant((1.0 / alpha_bar - 1.0) ** 0.5)
+        # a0_hat = clean_by_noisy a^k - clean_by_output (what the network gives)
+        self.clean_by_noisy = _constant(alpha_bar ** (0.5 if predicts_velocity else -0.5))
+        self.clean_by_output = _constant((1.0 - alpha_bar if predicts_velocity else 1.0 / alpha_bar - 1.0) ** 0.5)
         self.signal = _constant(alpha_bar**0.5)
         by_clean, by_noisy, self.std = transition_weights(schedule, step, eta)
         self.by = _constant(by_clean), _constant(by_noisy)
@@ -167,7 +167,7 @@ class _ReverseStep:
 
     def clean(self, noisy_action: np.ndarray, predicted: np.ndarray) -> np.ndarray:
         """The estimate of the clean action, not clipped."""
-        return self.clean_by_noisy * noisy_action - self.clean_by_noise * predicted
+        return self.clean_by_noisy * noisy_action - self.clean_by_output * predicted
 
     def next(self, clean: np.ndarray, noisy_action: np.ndarray, scaled_noise: np.ndarray) -> np.ndarray:
         """From a^k to a^(k-1); the noise has the step's standard deviation."""
@@ -200,7 +200,7 @@ class _Denoiser:
         self.activation = ACTIVATIONS[actor.activation_fn].value
         eta = 1.0 if actor.sampler == "ddpm" else actor.ddim_eta
         n_steps = actor.schedule.n_steps
-        self.steps = [_ReverseStep(actor.schedule, step, eta) for step in range(n_steps)]
+        self.steps = [_ReverseStep(actor.schedule, step, eta, denoiser.predicts_velocity) for step in range(n_steps)]
         # From the last step to the first; the one at position p scales the noise of row p + 1, and the very last one none
         self.chain = [(k, self.steps[k]) for k in reversed(range(n_steps))]
         self.stds = np.array([step.std for _, step in self.chain], dtype=np.float32)[:, None, None]
@@ -217,7 +217,8 @@ class _Denoiser:
         """The first layer without the noisy action's part, for each diffusion step, shape ``(K, width, batch)``."""
         return time_part + self.condition_weight @ features
 
-    def predict_noise(self, noisy_action: np.ndarray, from_rest: np.ndarray) -> np.ndarray:
+    def predict(self, noisy_action: np.ndarray, from_rest: np.ndarray) -> np.ndarray:
+        """The noise, or the velocity."""
         hidden, activation = self.action_weight @ noisy_action, self.activation
         hidden += from_rest
         for weight, bias in self.layers:
@@ -245,7 +246,7 @@ class _Denoiser:
         predicted = first_prediction
         for position, (k, step) in enumerate(self.chain):
             if predicted is None:
-                predicted = self.predict_noise(action, bound[k])
+                predicted = self.predict(action, bound[k])
             clean = step.clean(action, predicted)
             if shift is not None:
                 clean += shift(_clip(clean), k)
@@ -256,7 +257,7 @@ class _Denoiser:
         """:meth:`DiffusionActor.adapt`, features of shape ``(n, batch)``, actions ``(d, batch)``."""
         step = self.steps[self.adapting_step]
         noisy = step.signal * action
-        return _clip(step.clean(noisy, self.predict_noise(noisy, self.bind(features, time_part[self.adapting_step]))))
+        return _clip(step.clean(noisy, self.predict(noisy, self.bind(features, time_part[self.adapting_step]))))
 
 
 def _shows_vectors(extractor: nn.Module) -> bool:
@@ -610,7 +611,7 @@ class NumpyActing:
         noise = noise.transpose(0, 2, 1)
         repeated = bound if n_candidates == 1 else np.repeat(bound, n_candidates, axis=2)
         start, scaled_noise = noise[0], self.denoiser.scaled(noise)
-        first_prediction = self.denoiser.predict_noise(start, repeated[-1])
+        first_prediction = self.denoiser.predict(start, repeated[-1])
         action = self.denoiser.sample(repeated, start, scaled_noise, first_prediction).T
         if n_candidates > 1:
             values = self.critics.values(features, action.T, n_candidates).reshape(-1, n_candidates)

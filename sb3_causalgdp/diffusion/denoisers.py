@@ -37,9 +37,13 @@ class MLPDenoiser(nn.Module):
     :param net_arch: Hidden layers, ``[]`` is a linear denoiser
     :param activation_fn: Activation class
     :param time_embedding_dim: Size of the embedding of the diffusion step
+    :param alpha_bar: Where the perceptron gives the velocity v = sqrt(alpha_bar) eps - sqrt(1 - alpha_bar) a^0 (Salimans and
+        Ho, 2022, section 4), from which the noise follows: alpha_bar of each diffusion step, shape ``(K,)``. What it says of
+        the clean action is then of one size at all steps. None where it gives the noise itself
     """
 
     time_table: th.Tensor
+    signal_and_noise: th.Tensor
 
     def __init__(
         self,
@@ -49,9 +53,13 @@ class MLPDenoiser(nn.Module):
         net_arch: list[int],
         activation_fn: type[nn.Module] = nn.Mish,
         time_embedding_dim: int = 16,
+        alpha_bar: th.Tensor | None = None,
     ) -> None:
         super().__init__()
         self.action_dim = action_dim
+        self.predicts_velocity = alpha_bar is not None
+        parts = th.zeros(2, n_steps, 1) if alpha_bar is None else th.stack([alpha_bar, 1.0 - alpha_bar]).sqrt().unsqueeze(2)
+        self.register_buffer("signal_and_noise", parts, persistent=False)
         self.register_buffer("time_table", sinusoidal_embedding(n_steps, time_embedding_dim), persistent=False)
         self.time_mlp = nn.Sequential(
             nn.Linear(time_embedding_dim, 2 * time_embedding_dim),
@@ -80,7 +88,11 @@ class MLPDenoiser(nn.Module):
         from_time = linear(self.time_mlp(self.time_table), time_weight)
 
         def predict_noise(noisy_action: th.Tensor, step: int | th.Tensor) -> th.Tensor:
-            return self.network(th.addmm(from_condition + from_time[step], noisy_action, action_weight.t()))
+            output = self.network(th.addmm(from_condition + from_time[step], noisy_action, action_weight.t()))
+            if not self.predicts_velocity:
+                return output
+            signal, noise = self.signal_and_noise
+            return signal[step] * output + noise[step] * noisy_action
 
         return predict_noise
 
