@@ -374,7 +374,11 @@ class CausalGDP(OfflineToOnlineAlgorithm):
         # The policy gets our arguments too, but they must not enter the user's own dictionary
         self.policy_kwargs = {**self._own_policy_kwargs(), **policy_kwargs, **check_arguments(POLICY_ARGUMENTS, policy_kwargs)}
         try:
-            super()._setup_model()
+            with warnings.catch_warnings():
+                if self.replay_buffer_class is NStepReplayBuffer and self.replay_buffer_kwargs.get("n_steps") == self.n_steps:
+                    # A loaded model's, of which SB3 says that n_steps is ignored
+                    warnings.filterwarnings("ignore", message="`n_steps=")
+                super()._setup_model()
         except MemoryError as error:
             raise ValueError(f"buffer_size={self.buffer_size} does not fit into memory: {error}") from error
         finally:
