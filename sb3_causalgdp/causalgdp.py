@@ -40,6 +40,14 @@ from sb3_causalgdp.questions import AskedAlgorithm
 from sb3_causalgdp.saving.algorithm import SavedAlgorithm
 from sb3_causalgdp.updates import Losses, StepPlan, Updates, optimizer_of
 
+# The policy's, of models that were saved before they changed
+FIRST_DEFAULTS: dict[str, Any] = {
+    "net_arch": [256, 256],
+    "critic_layer_norm": False,
+    "normalize_observations": False,
+    "prediction_type": "noise",
+}
+
 SelfCausalGDP = TypeVar("SelfCausalGDP", bound="CausalGDP")
 
 
@@ -266,6 +274,7 @@ class CausalGDP(AskedAlgorithm, SavedAlgorithm):
             reward_transform=reward_transform,
         )
         self._chooses_n_steps = n_steps == "auto"
+        self._has_first_defaults = False
         self.critic_learning_rate = critic_learning_rate
         self.world_model_learning_rate = world_model_learning_rate
         self.eta = eta
@@ -317,6 +326,8 @@ class CausalGDP(AskedAlgorithm, SavedAlgorithm):
 
     def _setup_model(self) -> None:
         self._choose_n_steps()
+        if self._has_first_defaults:
+            self.policy_kwargs = {**FIRST_DEFAULTS, **self.policy_kwargs}
         self._check_arguments()
         policy_kwargs = self.policy_kwargs
         # The policy gets our arguments too, but they must not enter the user's own dictionary
