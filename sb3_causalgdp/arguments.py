@@ -26,6 +26,7 @@ from sb3_causalgdp.diffusion.schedules import NOISE_SCHEDULES
 from sb3_causalgdp.offline.rewards import REWARD_TRANSFORMS
 
 ACTOR_UPDATES = ("one_step", "chain")
+CRITIC_NORMALIZATIONS = ("batch", "layer")
 PREDICTION_TYPES = ("noise", "velocity")
 Q_SCALES = ("value", "advantage")
 GUIDANCE_TARGETS = ("return", "reward")
@@ -354,7 +355,7 @@ POLICY_ARGUMENTS: dict[str, Kind] = {
     ),
     "optimizer_kwargs": KEYWORDS | NONE,
     "n_critics": integer(1, MOST_CRITICS),
-    "critic_layer_norm": FLAG,
+    "critic_normalization": choice(CRITIC_NORMALIZATIONS) | NONE,
     "normalize_observations": FLAG,
     "prediction_type": choice(PREDICTION_TYPES),
     "share_features_extractor": FLAG,

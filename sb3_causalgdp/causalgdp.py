@@ -38,15 +38,8 @@ from sb3_causalgdp.offline.replay import SpacesEnv
 from sb3_causalgdp.policies import CausalGDPPolicy, CnnPolicy, DiffusionActor, MlpPolicy, MultiInputPolicy
 from sb3_causalgdp.questions import AskedAlgorithm
 from sb3_causalgdp.saving.algorithm import SavedAlgorithm
+from sb3_causalgdp.saving.policies import with_first_defaults
 from sb3_causalgdp.updates import Losses, StepPlan, Updates, optimizer_of
-
-# The policy's, of models that were saved before they changed
-FIRST_DEFAULTS: dict[str, Any] = {
-    "net_arch": [256, 256],
-    "critic_layer_norm": False,
-    "normalize_observations": False,
-    "prediction_type": "noise",
-}
 
 SelfCausalGDP = TypeVar("SelfCausalGDP", bound="CausalGDP")
 
@@ -178,7 +171,7 @@ class CausalGDP(AskedAlgorithm, SavedAlgorithm):
         self,
         policy: str | type[CausalGDPPolicy],
         env: GymEnv | str,
-        learning_rate: float | Schedule = 3e-4,
+        learning_rate: float | Schedule = 1e-3,
         buffer_size: int = 1_000_000,  # 1e6
         learning_starts: int = 100,
         batch_size: int = 256,
@@ -198,7 +191,7 @@ class CausalGDP(AskedAlgorithm, SavedAlgorithm):
         actor_update: str = "one_step",
         q_scale: str = "value",
         bound_penalty: float = 0.1,
-        policy_delay: int = 2,
+        policy_delay: int = 3,
         world_model_delay: int = 2,
         target_policy_noise: float = 0.2,
         target_noise_clip: float = 0.5,
@@ -327,7 +320,7 @@ class CausalGDP(AskedAlgorithm, SavedAlgorithm):
     def _setup_model(self) -> None:
         self._choose_n_steps()
         if self._has_first_defaults:
-            self.policy_kwargs = {**FIRST_DEFAULTS, **self.policy_kwargs}
+            self.policy_kwargs = with_first_defaults(self.policy_kwargs)
         self._check_arguments()
         policy_kwargs = self.policy_kwargs
         # The policy gets our arguments too, but they must not enter the user's own dictionary
@@ -344,6 +337,10 @@ class CausalGDP(AskedAlgorithm, SavedAlgorithm):
         if self.num_timesteps > 0 and self.seed is not None:
             # A loaded model would live through the random numbers and start states of its first steps again
             self.set_random_seed(fresh_seed(self))
+        if self.max_q_backup and self.policy.critic.normalizes_batches:
+            raise ValueError(
+                "max_q_backup must be False without target critics, got True: critic_normalization='layer' has them"
+            )
         self._create_aliases()
         self._setup_discovery()
 

@@ -1,6 +1,9 @@
 """Diffusion actor and critics: what a policy is made of, beside the world model."""
 
-from typing import Any
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import partial
+from typing import Any, TypeVar
 
 import torch as th
 from gymnasium import spaces
@@ -14,6 +17,8 @@ from sb3_causalgdp.acceleration.products import make_layers_fast
 from sb3_causalgdp.diffusion import Guidance, GuidanceRule, MLPDenoiser, NoiseSchedule, sample
 from sb3_causalgdp.diffusion.samplers import bind, check_sampler
 from sb3_causalgdp.saving.policies import PickledAlone
+
+SelfCritic = TypeVar("SelfCritic", bound="Critic")
 
 ACTIVATIONS: dict[str, type[nn.Module]] = {
     "mish": nn.Mish,
@@ -58,22 +63,74 @@ def q_values(
 
 class Critic(PickledAlone, ContinuousCritic):
     """
-    SB3's critics, with layer normalisation between each hidden layer and its activation if asked for.
+    SB3's critics, with layer or batch normalisation if asked for.
 
-    :param layer_norm: Whether to normalise the hidden layers
+    :param normalization: ``layer`` normalises hidden layers before their activation, ``batch`` the inputs of each layer over
+        the batch, as in CrossQ; None for none
     :param kwargs: Keyword arguments of SB3's critics
     """
 
-    def __init__(self, layer_norm: bool = False, **kwargs: Any) -> None:
+    BATCH_NORM_MOMENTUM = 0.01
+    BATCH_NORM_EPSILON = 1e-3
+
+    def __init__(self, normalization: str | None = None, **kwargs: Any) -> None:
         super().__init__(**kwargs)
         n_inputs = kwargs["features_dim"] + get_action_dim(kwargs["action_space"])
+        norms: dict[str, list[Any]] = {}
+        if normalization == "layer":
+            norms = {"post_linear_modules": [nn.LayerNorm]}
+        elif normalization == "batch":
+            norms = {
+                "pre_linear_modules": [partial(nn.BatchNorm1d, eps=self.BATCH_NORM_EPSILON, momentum=self.BATCH_NORM_MOMENTUM)]
+            }
         for index, network in enumerate(self.q_networks):
-            if layer_norm:
-                norms: list[type[nn.Module]] = [nn.LayerNorm]
-                layers = create_mlp(n_inputs, 1, kwargs["net_arch"], kwargs["activation_fn"], post_linear_modules=norms)
+            if norms:
+                layers = create_mlp(n_inputs, 1, kwargs["net_arch"], kwargs["activation_fn"], **norms)
                 self.q_networks[index] = network = nn.Sequential(*layers)
                 setattr(self, f"qf{index}", network)
             make_layers_fast(network)
+        modules = (module for network in self.q_networks for module in network.modules())
+        self._batch_norms = tuple(module for module in modules if isinstance(module, nn.BatchNorm1d))
+
+    @property
+    def normalizes_batches(self) -> bool:
+        """Whether what it says of an action depends on the batch while it is trained, and on running averages otherwise."""
+        return len(self._batch_norms) > 0
+
+    def train(self: SelfCritic, mode: bool = True) -> SelfCritic:
+        super().train(mode)
+        for module in self._batch_norms:
+            module.training = False
+        return self
+
+    @contextmanager
+    def batch_statistics(self) -> Iterator[None]:
+        """Within it, batches are normalised by their own statistics, which enter the running ones."""
+        for module in self._batch_norms:
+            module.training = True
+        yield
+        for module in self._batch_norms:
+            module.training = False
+
+    def forward_both(
+        self, observations: PyTorchObs, actions: th.Tensor, next_observations: PyTorchObs, next_actions: th.Tensor
+    ) -> tuple[list[th.Tensor], list[th.Tensor]]:
+        """
+        Judge actions and those that follow in one batch, whose statistics are then those of both (CrossQ, Bhatt et al., 2024,
+        section 3).
+
+        :param observations: Of the batch
+        :param actions: Shape ``(batch, d)``
+        :param next_observations: That followed
+        :param next_actions: In these, shape ``(batch, d)``
+        :return: Q of the first and of the second, one of shape ``(batch, 1)`` for each critic
+        """
+        features = self.extract_features(observations, self.features_extractor)
+        with th.no_grad():
+            next_features = self.extract_features(next_observations, self.features_extractor)
+        both = q_values(self, th.cat([features, next_features]), th.cat([actions, next_actions]))
+        n_rows = len(actions)
+        return [values[:n_rows] for values in both], [values[n_rows:].detach() for values in both]
 
 
 class DiffusionActor(PickledAlone, BasePolicy):

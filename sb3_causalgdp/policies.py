@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.policies import ContinuousCritic
 from stable_baselines3.common.preprocessing import is_image_space, preprocess_obs
 from stable_baselines3.common.torch_layers import (
     BaseFeaturesExtractor,
@@ -52,8 +51,9 @@ class CausalGDPPolicy(SavedPolicy):
     :param optimizer_class: Optimizer of the actor, the critics and the world model
     :param optimizer_kwargs: Its keyword arguments, without the learning rate
     :param n_critics: Number of critics
-    :param critic_layer_norm: Whether the critics' hidden layers have layer normalisation, which bounds what they say of
-        actions that the data does not hold (RLPD, Ball et al., 2023, section 4.2)
+    :param critic_normalization: ``batch`` normalises the inputs of the critics' layers over the batch, and needs no target
+        critics (CrossQ, Bhatt et al., 2024); ``layer`` their hidden layers, which bounds what they say of actions that the
+        data does not hold (RLPD, Ball et al., 2023, section 4.2): for offline data; None is neither
     :param normalize_observations: Whether actor and critics see observations in the standard deviations that the world model
         measures while it trains; where there are images or an extractor of your own, they see them as they are
     :param share_features_extractor: Whether actor and critics share one features extractor
@@ -78,8 +78,9 @@ class CausalGDPPolicy(SavedPolicy):
 
     actor: DiffusionActor
     actor_target: DiffusionActor
-    critic: ContinuousCritic
-    critic_target: ContinuousCritic
+    critic: Critic
+    critic_target: Critic
+    """The critics themselves where they normalise batches."""
     reward_target: th.Tensor
     return_std: th.Tensor
     guidance_ready: th.Tensor
@@ -98,7 +99,7 @@ class CausalGDPPolicy(SavedPolicy):
         optimizer_class: type[th.optim.Optimizer] = th.optim.Adam,
         optimizer_kwargs: dict[str, Any] | None = None,
         n_critics: int = 2,
-        critic_layer_norm: bool = True,
+        critic_normalization: str | None = "batch",
         normalize_observations: bool = True,
         share_features_extractor: bool = False,
         world_model_net_arch: list[int] | None = None,
@@ -149,10 +150,10 @@ class CausalGDPPolicy(SavedPolicy):
         self.exploration_noise = exploration_noise
         self.discount = discount
 
-        self.net_arch = [256, 256, 256] if net_arch is None else net_arch
+        self.net_arch = [256, 256] if net_arch is None else net_arch
         self.activation_fn = activation_class(activation_fn)
         self.n_critics = n_critics
-        self.critic_layer_norm = critic_layer_norm
+        self.critic_normalization = critic_normalization
         self.normalize_observations = normalize_observations
         self.share_features_extractor = share_features_extractor
         self.world_model_net_arch = world_model_net_arch
@@ -176,7 +177,7 @@ class CausalGDPPolicy(SavedPolicy):
             "activation_fn": fast(self.activation_fn),
             "net_arch": critic_arch,
             "n_critics": n_critics,
-            "layer_norm": critic_layer_norm,
+            "normalization": critic_normalization,
             "share_features_extractor": share_features_extractor,
         }
         self._build(lr_schedule)
@@ -197,8 +198,10 @@ class CausalGDPPolicy(SavedPolicy):
         # With a shared features extractor, targets share theirs too, see SB3's TD3Policy
         shared = self.share_features_extractor
         self.critic = self.make_critic(self.actor.features_extractor if shared else None)
-        self.critic_target = self.make_critic(self.actor_target.features_extractor if shared else None)
-        self.critic_target.load_state_dict(self.critic.state_dict())
+        self.critic_target = self.critic
+        if not self.critic.normalizes_batches:
+            self.critic_target = self.make_critic(self.actor_target.features_extractor if shared else None)
+            self.critic_target.load_state_dict(self.critic.state_dict())
         self._check_guidance_steps()
 
         self.world_model = MaskedWorldModel(self._state_dim(), self.actor.action_dim, self.world_model_net_arch)
@@ -207,6 +210,9 @@ class CausalGDPPolicy(SavedPolicy):
         self.register_buffer("candidate_noise", noise, persistent=False)
 
         optimizer_kwargs = self.optimizer_kwargs
+        if issubclass(self.optimizer_class, (th.optim.Adam, th.optim.AdamW)) and self.critic.normalizes_batches:
+            # What batch statistics give is outdated soon (CrossQ)
+            optimizer_kwargs = {"betas": (0.5, 0.999), **optimizer_kwargs}
         if self.optimizer_class in (th.optim.Adam, th.optim.AdamW) and "foreach" not in optimizer_kwargs:
             # One kernel for all parameters: the update takes half the time
             optimizer_kwargs = {"fused": True, **optimizer_kwargs}
@@ -220,7 +226,8 @@ class CausalGDPPolicy(SavedPolicy):
             except (TypeError, ValueError) as error:
                 raise ValueError(f"optimizer_kwargs={self.optimizer_kwargs!r} do not fit: {error}") from error
         self.actor_target.set_training_mode(False)
-        self.critic_target.set_training_mode(False)
+        if self.critic_target is not self.critic:
+            self.critic_target.set_training_mode(False)
 
     def _check_guidance_steps(self) -> None:
         n_steps = self.actor.schedule.n_steps
@@ -265,7 +272,7 @@ class CausalGDPPolicy(SavedPolicy):
             optimizer_class=self.optimizer_class,
             optimizer_kwargs=self.optimizer_kwargs,
             n_critics=self.n_critics,
-            critic_layer_norm=self.critic_layer_norm,
+            critic_normalization=self.critic_normalization,
             normalize_observations=self.normalize_observations,
             share_features_extractor=self.share_features_extractor,
             world_model_net_arch=self.world_model_net_arch,

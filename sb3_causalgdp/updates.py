@@ -45,7 +45,7 @@ class StepBatch(NamedTuple):
     replay_data: Any
     """Of the critics: a sample of a replay buffer."""
     target: th.Tensor
-    """TD target of these rows, shape ``(batch, 1)``."""
+    """What :meth:`Updates.td_target` gave for these rows."""
     transitions: Any
     """Of the world model and the actor: the same sample, or one of single steps where returns are of several."""
     next_actions: th.Tensor | None
@@ -75,10 +75,13 @@ class Updates:
         networks = (self.actor, self.actor_target, self.critic, self.critic_target, self.world_model)
         # Once, because to visit all modules takes a hundredth of a gradient step
         self._parameters: dict[th.nn.Module, list[th.Tensor]] = {network: [*network.parameters()] for network in networks}
+        pairs = [(self.actor, self.actor_target), (self.critic, self.critic_target)]
+        if self.critic_target is self.critic:
+            pairs = pairs[:1]
         # Running mean and running var
         self._batch_norm_stats, self._batch_norm_stats_target = (
-            [statistic for network in pair for statistic in get_parameters_by_name(network, ["running_"])]
-            for pair in ((self.critic, self.actor), (self.critic_target, self.actor_target))
+            [statistic for network in networks for statistic in get_parameters_by_name(network, ["running_"])]
+            for networks in zip(*pairs, strict=True)
         )
         self.fast = FastSteps(self.optimizers(), model.compile, model.cuda_graph, model.device)
         for name in self.COMPILED:
@@ -165,21 +168,29 @@ class Updates:
     def td_target(self, replay_data) -> tuple[th.Tensor, th.Tensor]:
         """
         :param replay_data: Sample of a replay buffer
-        :return: Actions in the next states, from the chain of the actor's moving average, shape ``(batch, d)``; and the TD
-            target with them, shape ``(batch, 1)``
+        :return: Actions in the next states, shape ``(batch, d)``; and the TD target with them, shape ``(batch, 1)``, or, where
+            critics normalise batches, the actions of which they say it themselves, shape ``(batch, d)``
         """
-        # For n-step replay, discount factor is gamma**n_steps (when no early termination)
-        discounts = replay_data.discounts if replay_data.discounts is not None else self.model.gamma
         n_actions = self.N_BACKUP_ACTIONS if self.model.max_q_backup else 1
         next_observations = replay_data.next_observations
+        actor = self.actor if self.critic.normalizes_batches else self.actor_target
         with th.no_grad():
-            actor_features = self.actor_target.features(next_observations).repeat_interleave(n_actions, dim=0)
-            next_actions = self.actor_target.sample(actor_features)
+            actor_features = actor.features(next_observations).repeat_interleave(n_actions, dim=0)
+            next_actions = actor.sample(actor_features)
+            if self.critic.normalizes_batches:
+                return next_actions, self.smoothed(next_actions)
             critic_features = self.critic_target.extract_features(next_observations, self.critic_target.features_extractor)
             critic_features, smoothed = critic_features.repeat_interleave(n_actions, dim=0), self.smoothed(next_actions)
             next_q_values = q_values(self.critic_target, critic_features, smoothed)
-            target = td_target(next_q_values, replay_data.rewards, replay_data.dones, discounts, n_actions)
+            target = td_target(next_q_values, replay_data.rewards, replay_data.dones, self.discounts(replay_data), n_actions)
         return next_actions[::n_actions], target
+
+    def discounts(self, replay_data) -> th.Tensor | float:
+        """
+        :param replay_data: Sample of a replay buffer
+        :return: gamma, or for returns of several steps gamma**n_steps, less where the episode ended early
+        """
+        return replay_data.discounts if replay_data.discounts is not None else self.model.gamma
 
     def smoothed(self, actions: th.Tensor) -> th.Tensor:
         """
@@ -195,20 +206,27 @@ class Updates:
     def update_critics(self, replay_data, target: th.Tensor, running_weight: float) -> Losses:
         """
         :param replay_data: Sample of a replay buffer
-        :param target: TD target, shape ``(batch, 1)``
+        :param target: What :meth:`td_target` gave
         :param running_weight: Share of the target's standard deviation that enters the running one
         :return: The loss
         """
-        target_std, loss, gradients = self.critic_gradients(replay_data, target)
+        with self.critic.batch_statistics():
+            target_std, loss, gradients = self.critic_gradients(replay_data, target)
         self.step(self.critic, gradients)
         with th.no_grad():
             self.policy.return_std.lerp_(target_std, running_weight)
         return {"critic_loss": loss}
 
     def critic_gradients(self, replay_data, target: th.Tensor) -> tuple[th.Tensor, th.Tensor, Gradients]:
+        observations, actions = replay_data.observations, replay_data.actions
+        if self.critic.normalizes_batches:
+            q, next_q = self.critic.forward_both(observations, actions, replay_data.next_observations, target)
+            target = td_target(next_q, replay_data.rewards, replay_data.dones, self.discounts(replay_data))
+        else:
+            q = self.critic(observations, actions)
         target_std, target_mean = th.std_mean(target, correction=0)
         target_std = th.where(moves(target_std, target_mean), target_std, 1.0)
-        loss = critic_loss(self.critic(replay_data.observations, replay_data.actions), target)
+        loss = critic_loss(q, target)
         return target_std, loss.detach(), gradients_of(self.critic, loss)
 
     # World model ----------------------------------------------------------------------------------------------------------
@@ -328,8 +346,9 @@ class Updates:
     def update_averages(self) -> None:
         """Let the target critics, and the actor's moving average, follow."""
         # All parameters in one call, as SB3's polyak_update does one by one
-        online = self._parameters[self.critic] + self._parameters[self.actor]
-        targets = self._parameters[self.critic_target] + self._parameters[self.actor_target]
+        online, targets = self._parameters[self.actor], self._parameters[self.actor_target]
+        if self.critic_target is not self.critic:
+            online, targets = self._parameters[self.critic] + online, self._parameters[self.critic_target] + targets
         th._foreach_lerp_(targets, online, self.model.tau)
         # Copy running stats, see SB3's GH issue #996
         polyak_update(self._batch_norm_stats, self._batch_norm_stats_target, 1.0)

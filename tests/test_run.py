@@ -160,7 +160,7 @@ def test_number_of_critics(n_critics):
 
 def test_layer_norm_of_the_critics_bounds_their_values():
     plain, normalised = (
-        learn(policy_kwargs={**SMALL["policy_kwargs"], "critic_layer_norm": layer_norm}) for layer_norm in (False, True)
+        learn(policy_kwargs={**SMALL["policy_kwargs"], "critic_normalization": kind}) for kind in (None, "layer")
     )
     n_layers = len(SMALL["policy_kwargs"]["net_arch"])
     for critic in (normalised.critic, normalised.critic_target):

@@ -296,7 +296,7 @@ COMPILABLE = {
     "isotropic": {"guidance_covariance": "isotropic"},
     "ddim": {"sampler": "ddim"},
     "one critic": {"policy_kwargs": {"net_arch": [8], "n_critics": 1}},
-    "layer norm": {"policy_kwargs": {"net_arch": [8], "critic_layer_norm": True}},
+    "layer norm": {"policy_kwargs": {"net_arch": [8], "critic_normalization": "layer"}},
     "clipped": {"max_grad_norm": 0.1},
     "max_q_backup": {"max_q_backup": True},
     "memory": {"optimize_memory_usage": True, "replay_buffer_kwargs": {"handle_timeout_termination": False}},

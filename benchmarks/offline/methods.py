@@ -55,7 +55,7 @@ CAUSALGDP_METHODS: dict[str, dict[str, Any]] = {
     "notears_scaled": {"causal_discovery": "notears", "sample_masks": False},
     "perturbed_scaled": {**PERTURBED, "sample_masks": False},
     "no_guidance": {"guidance": None},
-    "layer_norm": {"policy_kwargs": {"net_arch": NET_ARCH, "critic_layer_norm": True}},
+    "layer_norm": {"policy_kwargs": {"net_arch": NET_ARCH, "critic_normalization": "layer"}},
     # Cloning a distribution means to play samples of it: not the best of ten, and none of exploration's noise
     "bc": {"eta": 0.0, "guidance": None, "n_action_candidates": 1, "exploration_noise": 0.0},
 }

@@ -28,6 +28,7 @@ from sb3_causalgdp.acceleration.numpy_networks import (
     WorldModel,
     has_plain_layers,
     view,
+    without_batch_norms,
     without_norms,
 )
 from sb3_causalgdp.diffusion import MLPDenoiser
@@ -120,7 +121,7 @@ class NumpyActing:
             GPU of CUDA, and a guidance without the denoiser's Jacobian
         """
         rule, activation = policy.guidance_rule, policy.activation_fn
-        critics = (without_norms(network)[0] for network in policy.critic_target.q_networks)
+        critics = (without_norms(without_batch_norms(network)[0])[0] for network in policy.critic_target.q_networks)
         networks: list[Any] = [policy.actor.denoiser.network, *critics]
         return (
             switch.is_on()

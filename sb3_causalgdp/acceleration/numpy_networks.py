@@ -128,7 +128,37 @@ class _LayerNorm:
         return centred * inverse_std, inverse_std
 
 
-def without_norms(network: nn.Sequential) -> tuple[list[nn.Module], list[nn.LayerNorm]]:
+class _BatchNorm:
+    """``nn.BatchNorm1d`` of columns, by its running averages."""
+
+    def __init__(self, module: nn.BatchNorm1d) -> None:
+        arrays = (module.weight, module.bias, module.running_mean, module.running_var)
+        self.weight, self.bias, self.mean, self.variance = (view(array)[:, None] for array in arrays)
+        self.epsilon = np.float32(module.eps)
+
+    def scale(self) -> np.ndarray:
+        return self.weight / np.sqrt(self.variance + self.epsilon)
+
+
+def without_batch_norms(network: nn.Sequential) -> tuple[list[nn.Module], list[nn.BatchNorm1d]]:
+    """The batch normalisations where each layer has one right in front of it, else none; and all other modules."""
+    modules = list(network)
+    norms = [norm for norm, layer in pairwise(modules) if isinstance(layer, nn.Linear) and _normalises_batches(norm, layer)]
+    if len(norms) != sum(isinstance(module, nn.Linear) for module in modules):
+        return modules, []
+    return [module for module in modules if not any(module is norm for norm in norms)], norms  # type: ignore[return-value]
+
+
+def _normalises_batches(module: nn.Module, layer: nn.Linear) -> bool:
+    return (
+        type(module) is nn.BatchNorm1d
+        and module.num_features == layer.in_features
+        and module.affine
+        and module.track_running_stats
+    )
+
+
+def without_norms(network: nn.Sequential | list[nn.Module]) -> tuple[list[nn.Module], list[nn.LayerNorm]]:
     """The normalisations where each layer but the last has one right behind it, else none; and all other modules."""
     modules = list(network)
     norms = [after for layer, after in pairwise(modules[:-1]) if isinstance(layer, nn.Linear) and _normalises(after, layer)]
@@ -290,14 +320,16 @@ class _Critic:
     """One target critic."""
 
     def __init__(self, network: nn.Sequential, activation_fn: type[nn.Module]) -> None:
-        modules, norms = without_norms(network)
+        modules, batch_norms = without_batch_norms(network)
+        modules, norms = without_norms(modules)
         self.layers = layers = _linear_layers(modules)
+        self.batch_norms = [_BatchNorm(norm) for norm in batch_norms]
         self.norms: Sequence[_LayerNorm | None] = [_LayerNorm(norm) for norm in norms] or [None] * (len(layers) - 1)
         self.activation = ACTIVATIONS[activation_fn]
 
     def values(self, features: np.ndarray, actions: np.ndarray, n_candidates: int) -> np.ndarray:
         """Q of several actions for each features; the features' part of the first layer is computed once."""
-        (weight, bias), *layers = self.layers
+        (weight, bias), *layers = self._layers()
         hidden = np.repeat(weight[:, : len(features)] @ features + bias, n_candidates, axis=1)
         hidden += weight[:, len(features) :] @ actions
         for norm, (next_weight, next_bias) in zip(self.norms, layers, strict=True):
@@ -308,13 +340,23 @@ class _Critic:
     def forward(self, inputs: np.ndarray) -> tuple[np.ndarray, list[_Hidden]]:
         """The values, and the hidden layers."""
         hidden = []
-        for norm, (weight, bias) in zip(self.norms, self.layers[:-1], strict=True):
+        *layers, (last_weight, last_bias) = self._layers()
+        for norm, (weight, bias) in zip(self.norms, layers, strict=True):
             product = weight.dot(inputs)
             product += bias
             hidden.append(self._hidden(norm, product))
             inputs = hidden[-1].output
-        weight, bias = self.layers[-1]
-        return weight.dot(inputs) + bias, hidden
+        return last_weight.dot(inputs) + last_bias, hidden
+
+    def _layers(self) -> list[Layer]:
+        """With the batch normalisations, which are maps of one slope and offset for each input, in the layers behind them."""
+        if not self.batch_norms:
+            return self.layers
+        layers = []
+        for norm, (weight, bias) in zip(self.batch_norms, self.layers, strict=True):
+            scale = norm.scale()
+            layers.append((weight * scale.T, bias + weight.dot(norm.bias - norm.mean * scale)))
+        return layers
 
     def _hidden(self, norm: _LayerNorm | None, product: np.ndarray) -> _Hidden:
         normalised = product if norm is None else norm(product)
@@ -322,7 +364,7 @@ class _Critic:
 
     def backward(self, hidden: list[_Hidden], n_states: int) -> np.ndarray:
         """Gradient of the values by the states, the first of the inputs."""
-        weights = [weight for weight, _ in self.layers]
+        weights = [weight for weight, _ in self._layers()]
         weights[0] = weights[0][:, :n_states]
         gradient = weights[-1].T
         for weight, layer, norm in zip(weights[-2::-1], reversed(hidden), reversed(self.norms), strict=True):

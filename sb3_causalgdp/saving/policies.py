@@ -19,6 +19,25 @@ SelfPolicy = TypeVar("SelfPolicy", bound="SavedPolicy")
 SelfNetwork = TypeVar("SelfNetwork", bound="PickledAlone")
 
 
+_FIRST_DEFAULTS: dict[str, Any] = {
+    "net_arch": [256, 256],
+    "critic_normalization": None,
+    "normalize_observations": False,
+    "prediction_type": "noise",
+}
+
+
+def with_first_defaults(arguments: dict[str, Any]) -> dict[str, Any]:
+    """
+    :param arguments: Of a policy that was saved before the defaults changed
+    :return: The same, with those defaults
+    """
+    changed = dict(arguments)
+    if "critic_layer_norm" in changed:
+        changed["critic_normalization"] = "layer" if changed.pop("critic_layer_norm") else None
+    return {**_FIRST_DEFAULTS, **changed}
+
+
 class PickledAlone(BaseModel):
     """A network that SB3 saves as a pickle, because it holds another one; a whole policy needs none."""
 
@@ -123,6 +142,8 @@ def _read_policy(
     content = saved.get(CONTENT)
     arguments = {} if content is None else decoded(read_json(content), saved[BLOCK].cpu().numpy().tobytes(), known)
     arguments = {**saved["data"], **arguments}
+    if "critic_normalization" not in arguments:
+        arguments = with_first_defaults(arguments)
     if not trusted:
         check_limits(arguments, size_of(file))
     # Schedules are not needed for predictions

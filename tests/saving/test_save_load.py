@@ -241,7 +241,7 @@ ARGUMENTS = {
     "causal_refresh_freq": 77,
     "causal_half_life": 1234.0,
     "tensorboard_log": "somewhere",
-    "policy_kwargs": {"net_arch": [8], "activation_fn": "tanh", "world_model_net_arch": [8], "critic_layer_norm": True},
+    "policy_kwargs": {"net_arch": [8], "activation_fn": "tanh", "world_model_net_arch": [8], "critic_normalization": "layer"},
     "compile": True,
     "cuda_graph": False,
     "torch_threads": 2,

@@ -18,7 +18,7 @@ TEN_STEPS_AS_AUTHORS = "CausalGDP, K=10, the networks of its authors' loop"
 AUTHORS_NETS = {
     "net_arch": {"pi": [256, 256], "qf": [256]},
     "activation_fn": "relu",
-    "critic_layer_norm": True,
+    "critic_normalization": "layer",
     "world_model_net_arch": [256],
 }
 STARTS = 2_100  # two causal graphs, with 16 environments too: they find theirs at 1,008 and 2,016
