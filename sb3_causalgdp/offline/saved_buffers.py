@@ -12,6 +12,7 @@ from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer
 from stable_baselines3.her.goal_selection_strategy import GoalSelectionStrategy
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
+from sb3_causalgdp.offline.replay import arrays_of
 from sb3_causalgdp.saving.archives import errors_of, is_zip, named, opened, read_arrays, read_pickle, write_arrays
 from sb3_causalgdp.saving.plain import FORMAT, SPACES, Known, NotPlainError, Writer, decoded, read_json
 
@@ -78,11 +79,9 @@ def _n_rows(buffer: ReplayBuffer) -> int:
 
 def _columns(buffer: ReplayBuffer) -> Iterator[tuple[str, np.ndarray]]:
     """By name, those of dictionaries with their key: ``(positions, n_envs, ...)``."""
-    for name, value in vars(buffer).items():
-        if isinstance(value, dict):
-            yield from ((f"{name}/{key}", column) for key, column in value.items() if isinstance(column, np.ndarray))
-        elif isinstance(value, np.ndarray) and value.ndim >= 2 and name not in NOT_WRITTEN:
-            yield name, value
+    for name, column in arrays_of(buffer):
+        if "/" in name or (column.ndim >= 2 and name not in NOT_WRITTEN):
+            yield name, column
 
 
 # Reading ----------------------------------------------------------------------------------------------------------------
