@@ -27,7 +27,7 @@ from sb3_causalgdp.checkpoints.environments import environment_state, restore_en
 from sb3_causalgdp.checkpoints.pickles import classes_in, from_bytes, to_bytes
 from sb3_causalgdp.checkpoints.store import Checkpoint, open_checkpoint, run_of, write_checkpoint
 from sb3_causalgdp.checkpoints.transitions import FOLDER, Log, rest_of, set_rest
-from sb3_causalgdp.files import replaced_when_done, temporary_folder
+from sb3_causalgdp.files import errors_about, replaced_when_done, temporary_folder
 from sb3_causalgdp.saving.archives import errors_of
 from sb3_causalgdp.saving.numpy_pickles import check_random_state
 
@@ -109,7 +109,7 @@ def save_checkpoint(
     path = Path(path)
     if path.suffix != ".zip":
         return _save_in_folder(model, path, callback, keep)
-    with temporary_folder(path.absolute().parent) as folder:
+    with temporary_folder(path.absolute().parent) as folder, errors_about(path):
         logs = bookkeeping_of(model).logs
         bookkeeping_of(model).logs = {}
         try:
