@@ -28,7 +28,9 @@ from sb3_causalgdp.checkpoints.pickles import classes_in, from_bytes, to_bytes
 from sb3_causalgdp.checkpoints.store import Checkpoint, open_checkpoint, run_of, write_checkpoint
 from sb3_causalgdp.checkpoints.transitions import FOLDER, Log, rest_of, set_rest
 from sb3_causalgdp.files import errors_about, replaced_when_done, temporary_folder
+from sb3_causalgdp.offline.saved_buffers import BUFFERS, check_columns
 from sb3_causalgdp.saving.archives import errors_of
+from sb3_causalgdp.saving.models import check_limits
 from sb3_causalgdp.saving.numpy_pickles import check_random_state
 
 SelfAlgorithm = TypeVar("SelfAlgorithm", bound=OffPolicyAlgorithm)
@@ -255,15 +257,13 @@ def resume(
         own.of_pretraining = checkpoint.manifest["pretraining"]
         own.was_complete = checkpoint.manifest["complete"]
         own.folder = None if checkpoint.path.is_file() else checkpoint.path.absolute().parent
-        try:
+        with errors_of(checkpoint.path, "cannot be resumed"):
             with checkpoint.read(STATE) as file:
                 allowed = classes_in(model.action_noise, model.replay_buffer)
                 # What learn() makes of an action noise
                 allowed |= {VectorizedActionNoise}
                 state = from_bytes(file.read(), allowed=allowed, trusted=trusted)
             _restore(model, checkpoint, state, trusted)
-        except ValueError as error:
-            raise ValueError(f"{checkpoint.path}: {error}") from error
     return model
 
 
@@ -277,8 +277,8 @@ def _restore(model: OffPolicyAlgorithm, checkpoint: Checkpoint, state: dict[str,
     environment = state["environment"]
     if environment is not None and model.env is not None and model.env.num_envs != environment["n_envs"]:
         raise ValueError(f"the checkpoint is of {environment['n_envs']} environments, got {model.env.num_envs}")
-    _restore_buffers(model, checkpoint, state["rest"])
-    vars(model).update(state["attributes"])
+    _restore_buffers(model, checkpoint, state["rest"], trusted)
+    vars(model).update({name: value for name, value in state["attributes"].items() if name in ATTRIBUTES})
     own = bookkeeping_of(model)
     own.callbacks = state["callbacks"]
     own.attributes = copy.deepcopy({name: value for name, value in state["attributes"].items() if name in SET_BY_LEARN})
@@ -290,16 +290,20 @@ def _restore(model: OffPolicyAlgorithm, checkpoint: Checkpoint, state: dict[str,
     _set_generators(model, state["generators"])
 
 
-def _restore_buffers(model: Any, checkpoint: Checkpoint, rest: dict[str, Any]) -> None:
+def _restore_buffers(model: Any, checkpoint: Checkpoint, rest: dict[str, Any], trusted: bool) -> None:
     own = bookkeeping_of(model)
     for name, content in checkpoint.manifest["buffers"].items():
         of_buffer = rest[name]
         buffer = model.replay_buffer
+        if not trusted:
+            check_limits({key: of_buffer[key] for key in ("buffer_size", "n_envs")}, 0)
         if name == "offline" or of_buffer["buffer_size"] != buffer.buffer_size:
             buffer = model._new_buffer(of_buffer["buffer_size"] * of_buffer["n_envs"])
         log = Log.from_json(content, buffer)
         log.fill(buffer, checkpoint.read)
         set_rest(buffer, of_buffer)
+        if not trusted and type(buffer) in BUFFERS:
+            check_columns(buffer, f"the replay buffer {name!r}")
         own.logs[name] = log
         setattr(model, "offline_buffer" if name == "offline" else "replay_buffer", buffer)
     if checkpoint.manifest["one_buffer"]:
