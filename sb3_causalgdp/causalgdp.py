@@ -18,7 +18,7 @@ from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy, ContinuousCritic
-from stable_baselines3.common.save_util import load_from_zip_file, open_path, recursive_getattr
+from stable_baselines3.common.save_util import open_path, recursive_getattr
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.utils import FloatSchedule, get_parameters_by_name, polyak_update, update_learning_rate
 
@@ -58,7 +58,7 @@ from sb3_causalgdp.offline.preload import normalised_parts
 from sb3_causalgdp.offline.replay import concatenate_samples, deal_rows, rows_of
 from sb3_causalgdp.policies import CausalGDPPolicy, CnnPolicy, DiffusionActor, MlpPolicy, MultiInputPolicy, q_values
 from sb3_causalgdp.saving.archives import errors_of
-from sb3_causalgdp.saving.models import KNOWN, LARGE, append_entries, plain_entries, read_values
+from sb3_causalgdp.saving.models import KNOWN, LARGE, append_entries, plain_entries, read_parameters, read_values
 from sb3_causalgdp.saving.plain import Known
 from sb3_causalgdp.structural import StatePolicy, actions_of, make_structural_model, states_of
 
@@ -1057,7 +1057,7 @@ class CausalGDP(OfflineToOnlineAlgorithm):
         """
         params = load_path_or_dict
         if not isinstance(params, dict):
-            _, params, _ = load_from_zip_file(params, device=device, load_data=False)
+            params = read_parameters(params, device)
         before = deepcopy(self.get_parameters())
         self._check_parameters(params)
         try:
