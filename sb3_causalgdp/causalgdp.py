@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 import torch as th
 from gymnasium import spaces
+from stable_baselines3.common.base_class import maybe_make_env
 from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.noise import ActionNoise
@@ -1123,7 +1124,7 @@ class CausalGDP(OfflineToOnlineAlgorithm):
     def load(  # type: ignore[override]
         cls: type[SelfCausalGDP],
         path: str | pathlib.Path | io.BufferedIOBase,
-        env: GymEnv | None = None,
+        env: GymEnv | str | None = None,
         device: th.device | str = "auto",
         custom_objects: dict[str, Any] | None = None,
         print_system_info: bool = False,
@@ -1141,8 +1142,8 @@ class CausalGDP(OfflineToOnlineAlgorithm):
         of a version that pickled all.
 
         :param path: Path to the file (or a file-like) where to load the agent from
-        :param env: The new environment to run the loaded model on (can be None if you only need prediction from a trained
-            model)
+        :param env: The new environment to run the loaded model on, or its id (can be None if you only need prediction from a
+            trained model)
         :param device: Device on which the code should be run
         :param custom_objects: What is taken in place of the attributes of these names, which are not read
         :param print_system_info: Whether to print system info from the saved model and the current system info
@@ -1155,6 +1156,8 @@ class CausalGDP(OfflineToOnlineAlgorithm):
         if custom_objects is not None and not isinstance(custom_objects, dict):
             raise ValueError(f"custom_objects must be a dict or None, got {type(custom_objects).__name__}")
         given = {**(custom_objects or {}), **{name: value for name, value in kwargs.items() if name != "policy_kwargs"}}
+        # SB3's constructor takes an id, and its load does not
+        env = None if env is None else maybe_make_env(env, verbose=0)
         file = open_path(path, "r", suffix="zip")
         try:
             with errors_of(path, "cannot be loaded"):
@@ -1217,7 +1220,7 @@ class CausalGDP(OfflineToOnlineAlgorithm):
     def resume(
         cls: type[SelfCausalGDP],
         path: str | pathlib.Path,
-        env: GymEnv | None = None,
+        env: GymEnv | str | None = None,
         device: th.device | str = "auto",
         trusted: bool = False,
     ) -> SelfCausalGDP:
@@ -1226,7 +1229,7 @@ class CausalGDP(OfflineToOnlineAlgorithm):
         whole checkpoint. ``model.learn(model.remaining_timesteps, reset_num_timesteps=False)`` does the rest.
 
         :param path: Folder of checkpoints, one of them, or a zip file
-        :param env: Environment that is made as the first one was; None where :meth:`pretrain` goes on
+        :param env: Environment that is made as the first one was, or its id; None where :meth:`pretrain` goes on
         :param device: Device on which the code should be run
         :param trusted: Whether the files may name Python objects that could run code
         :return: The model

@@ -15,6 +15,7 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 import torch as th
+from stable_baselines3.common.base_class import maybe_make_env
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import VectorizedActionNoise
@@ -230,7 +231,7 @@ def _generators(model: OffPolicyAlgorithm) -> dict[str, Any]:
 def resume(
     algorithm: type[SelfAlgorithm],
     path: str | Path,
-    env: GymEnv | None = None,
+    env: GymEnv | str | None = None,
     device: th.device | str = "auto",
     trusted: bool = False,
 ) -> SelfAlgorithm:
@@ -239,13 +240,14 @@ def resume(
 
     :param algorithm: Class of the model
     :param path: Folder of checkpoints, one of them, or a zip file
-    :param env: Environment that was made as the first one; None where the training needs none
+    :param env: Environment that was made as the first one, or its id; None where the training needs none
     :param device: Device on which the code should be run
     :param trusted: Whether the file may name Python objects that could run code
     :return: The model
     :raises FileNotFoundError: If there is no checkpoint
     :raises ValueError: If none is whole, or the environment is another one
     """
+    env = None if env is None else maybe_make_env(env, verbose=0)
     with open_checkpoint(Path(path)) as checkpoint:
         # SB3's own algorithms trust every file
         trust: dict[str, Any] = {"trusted": trusted} if "trusted" in inspect.signature(algorithm.load).parameters else {}

@@ -11,6 +11,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 from gymnasium import spaces
+from stable_baselines3.common.base_class import maybe_make_env
 from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback, ProgressBarCallback
 from stable_baselines3.common.noise import ActionNoise, VectorizedActionNoise
@@ -141,14 +142,15 @@ class OfflineToOnlineAlgorithm(OffPolicyAlgorithm):
         model.env, model.observation_layout = None, layout if layout is not observation_space else None
         return model
 
-    def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
+    def set_env(self, env: GymEnv | str, force_reset: bool = True) -> None:
         """
         Set the environment, see SB3's ``set_env``. A training ``VecNormalize`` counts the preloaded transitions.
 
-        :param env: The environment
+        :param env: The environment, or its id
         :param force_reset: Whether it is reset before training goes on
         :raises ValueError: If its ``VecNormalize`` would normalise the observations of a policy that was trained on others
         """
+        env = maybe_make_env(env, self.verbose)
         normalizer = unwrap_vec_normalize(env) if isinstance(env, VecEnv) else None
         self._check_normalisation(normalizer)
         layout = self._checked_layout(env)
