@@ -58,7 +58,7 @@ from sb3_causalgdp.offline.algorithm import OfflineToOnlineAlgorithm, callback_l
 from sb3_causalgdp.offline.preload import normalised_parts
 from sb3_causalgdp.offline.replay import concatenate_samples, deal_rows, rows_of
 from sb3_causalgdp.policies import CausalGDPPolicy, CnnPolicy, DiffusionActor, MlpPolicy, MultiInputPolicy, q_values
-from sb3_causalgdp.saving.archives import errors_of
+from sb3_causalgdp.saving.archives import errors_of, named, one_line
 from sb3_causalgdp.saving.models import KNOWN, LARGE, append_entries, plain_entries, read_parameters, read_values
 from sb3_causalgdp.saving.plain import Known
 from sb3_causalgdp.structural import StatePolicy, actions_of, make_structural_model, states_of
@@ -1053,12 +1053,18 @@ class CausalGDP(OfflineToOnlineAlgorithm):
         :param load_path_or_dict: Path of a saved model, or what ``get_parameters`` gave
         :param exact_match: Whether the parameters of each module, and each of their parameters, have to be there
         :param device: Device on which the code should run
-        :raises ValueError: If one is NaN or infinite, unknown or missing, or an optimizer's state does not fit its parameters
+        :raises ValueError: If one is NaN or infinite, unknown or missing, or an optimizer's state does not fit its parameters;
+            of a file also if it is not whole
         :raises RuntimeError: If a network is another one
         """
+        if not isinstance(load_path_or_dict, dict):
+            params = read_parameters(load_path_or_dict, device)
+            try:
+                self.set_parameters(params, exact_match, device)
+            except Exception as error:
+                raise ParametersError(f"{named(load_path_or_dict)} cannot be loaded: {one_line(error)}") from error
+            return
         params = load_path_or_dict
-        if not isinstance(params, dict):
-            params = read_parameters(params, device)
         before = deepcopy(self.get_parameters())
         self._check_parameters(params)
         try:

@@ -28,7 +28,7 @@ def is_finite(values: np.ndarray) -> bool:
 
 def many_are_finite(values: np.ndarray) -> bool:
     """
-    As :func:`is_finite`, at half the cost for thousands of numbers: their sum is finite only where all are, unless it overflows.
+    As :func:`is_finite`, at half the cost for thousands of numbers: only where all are finite, their sum is, or it overflows.
 
     :param values: Of any type and shape
     :return: Whether all are finite

@@ -3,10 +3,10 @@ Damage files with fixed seeds, read them in processes of their own, and count wh
 
     python benchmarks/reliability/mutate.py --mutations 3000
 
-Model zips, checkpoints, policies, replay buffers, datasets of arrays and of HDF5, and graphs are changed: bits flipped, the file cut,
-entries of archives swapped, numbers and texts in JSON replaced by wild ones with sound checksums. What is then read has to be
-used without harm, or refused by one line that names the file. Counted are crashes of the process, hangs, errors of another
-kind, and NaN that nobody mentions.
+Model zips, checkpoints, policies, replay buffers, datasets of arrays and of HDF5, and graphs are changed: bits flipped, the
+file cut, entries of archives swapped, numbers and texts in JSON replaced by wild ones with sound checksums. What is then read
+has to be used without harm, or refused by one line that names the file. Counted are crashes of the process, hangs, errors of
+another kind, and NaN that nobody mentions.
 """
 
 import argparse

@@ -248,10 +248,10 @@ def resume(
     :raises ValueError: If none is whole, or the environment is another one
     """
     env = None if env is None else maybe_make_env(env, verbose=0)
-    with open_checkpoint(Path(path)) as checkpoint:
+    with open_checkpoint(Path(path)) as checkpoint, errors_of(checkpoint.path, "cannot be resumed"):
         # SB3's own algorithms trust every file
         trust: dict[str, Any] = {"trusted": trusted} if "trusted" in inspect.signature(algorithm.load).parameters else {}
-        with checkpoint.read(MODEL) as file, errors_of(checkpoint.path, "cannot be resumed"):
+        with checkpoint.read(MODEL) as file:
             model = algorithm.load(io.BytesIO(file.read()), env=env, device=device, force_reset=False, **trust)
         _check(model, checkpoint)
         own = bookkeeping_of(model)
@@ -259,13 +259,12 @@ def resume(
         own.of_pretraining = checkpoint.manifest["pretraining"]
         own.was_complete = checkpoint.manifest["complete"]
         own.folder = None if checkpoint.path.is_file() else checkpoint.path.absolute().parent
-        with errors_of(checkpoint.path, "cannot be resumed"):
-            with checkpoint.read(STATE) as file:
-                allowed = classes_in(model.action_noise, model.replay_buffer)
-                # What learn() makes of an action noise
-                allowed |= {VectorizedActionNoise}
-                state = from_bytes(file.read(), allowed=allowed, trusted=trusted)
-            _restore(model, checkpoint, state, trusted)
+        with checkpoint.read(STATE) as file:
+            allowed = classes_in(model.action_noise, model.replay_buffer)
+            # What learn() makes of an action noise
+            allowed |= {VectorizedActionNoise}
+            state = from_bytes(file.read(), allowed=allowed, trusted=trusted)
+        _restore(model, checkpoint, state, trusted)
     return model
 
 

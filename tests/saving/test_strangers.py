@@ -249,6 +249,19 @@ def test_damage_that_a_checksum_shows_is_refused(saved, tmp_path):
         CausalGDP("MlpPolicy", "Pendulum-v1", **TINY).set_parameters(tmp_path / "damaged.zip")
 
 
+def test_parameters_that_do_not_fit_are_refused_by_the_name_of_their_file(model, saved, tmp_path):
+    wider = CausalGDP("MlpPolicy", "Pendulum-v1", **{**TINY, "policy_kwargs": {"net_arch": [16]}})
+    without = tmp_path / "without.zip"
+    with zipfile.ZipFile(saved) as archive, zipfile.ZipFile(without, "w") as other:
+        for name in archive.namelist():
+            if name != "actor.optimizer.pth":
+                other.writestr(name, archive.read(name))
+    for one, path in ((wider, saved), (model, without)):
+        with pytest.raises(ValueError, match=f"{path.name} cannot be loaded: ") as error:
+            one.set_parameters(path)
+        assert "\n" not in str(error.value)
+
+
 # Policies, graphs, checkpoints ------------------------------------------------------------------------------------------
 
 
@@ -320,6 +333,7 @@ def named(name):
         (segment(first=-5), "is not about 230 rows"),
         (segment(first="many"), "TypeError"),
         (lambda manifest: {**manifest, "buffers": {"online": {}}}, "KeyError: 'segments'"),
+        (lambda manifest: {name: value for name, value in manifest.items() if name != "run"}, "KeyError: 'run'"),
     ],
 )
 def test_a_checkpoint_cannot_point_elsewhere(model, tmp_path, change, message):
@@ -333,7 +347,7 @@ def test_a_folder_of_checkpoints_with_a_device_in_it_is_refused(model, tmp_path)
     folder = model.save_checkpoint(tmp_path / "there")
     (folder / "state.bin").unlink()
     (folder / "state.bin").symlink_to("/dev/zero")
-    with pytest.raises(ValueError, match="state.bin is no file"):
+    with pytest.raises(ValueError, match=r"state\.bin is no file"):
         CausalGDP.resume(folder, gym.make("Pendulum-v1"))
 
 
