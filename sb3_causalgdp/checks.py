@@ -26,6 +26,19 @@ def is_finite(values: np.ndarray) -> bool:
     return values.dtype.kind != "f" or bool(np.isfinite(values).all())
 
 
+def many_are_finite(values: np.ndarray) -> bool:
+    """
+    As :func:`is_finite`, at half the cost for thousands of numbers: only where all are finite, their sum is, or it overflows.
+
+    :param values: Of any type and shape
+    :return: Whether all are finite
+    """
+    if values.dtype.kind != "f":
+        return True
+    with np.errstate(over="ignore", invalid="ignore"):
+        return bool(np.isfinite(values.sum())) or is_finite(values)
+
+
 def fits_float32(values: np.ndarray) -> bool:
     """
     :param values: Of any type and shape

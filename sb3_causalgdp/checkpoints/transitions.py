@@ -13,6 +13,7 @@ from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 from sb3_causalgdp.checkpoints.pickles import from_bytes, to_bytes
 from sb3_causalgdp.files import replaced_when_done
 from sb3_causalgdp.offline.replay import arrays_of
+from sb3_causalgdp.saving.archives import read_arrays
 
 FOLDER = "transitions"
 # Rows of these are never changed once they were written; what other classes do is not known
@@ -117,9 +118,14 @@ class Log:
         columns = dict(_columns(buffer))
         for segment in self.segments:
             first = max(segment.first, self.stored - buffer.buffer_size)
+            if not (Path(segment.name).name == segment.name and 0 <= segment.first <= segment.end <= self.stored):
+                raise ValueError(f"{segment} is not about {self.stored} rows")
             indices = (self.position - (self.stored - np.arange(first, segment.end))) % buffer.buffer_size
-            with read(f"{FOLDER}/{segment.name}") as file, np.load(file, allow_pickle=False) as rows:
+            with read(f"{FOLDER}/{segment.name}") as file:
                 for name, column in columns.items():
+                    rows = read_arrays(file, (name,))
+                    if name not in rows:
+                        raise ValueError(f"{segment.name} lacks {name}")
                     column[indices] = _decoded(rows[name])[first - segment.first :]
 
 

@@ -10,8 +10,9 @@ from typing import Any, TypeVar
 
 import numpy as np
 import torch as th
+from stable_baselines3.common.base_class import maybe_make_env
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.save_util import load_from_zip_file, open_path, recursive_getattr
+from stable_baselines3.common.save_util import open_path, recursive_getattr
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 
 from sb3_causalgdp.checkpoints import TrainingCheckpointCallback, resume, save_checkpoint
@@ -21,8 +22,8 @@ from sb3_causalgdp.files import write_bytes
 from sb3_causalgdp.knowledge import DiscoveringAlgorithm
 from sb3_causalgdp.offline.algorithm import callback_list
 from sb3_causalgdp.policies import CausalGDPPolicy, CnnPolicy, MultiInputPolicy
-from sb3_causalgdp.saving.archives import errors_of
-from sb3_causalgdp.saving.models import KNOWN, LARGE, append_entries, plain_entries, read_values
+from sb3_causalgdp.saving.archives import errors_of, named, one_line
+from sb3_causalgdp.saving.models import KNOWN, LARGE, append_entries, plain_entries, read_parameters, read_values
 from sb3_causalgdp.saving.plain import Known
 
 NETWORKS = ("policy", "actor", "critic", "world_model")
@@ -51,12 +52,18 @@ class SavedAlgorithm(DiscoveringAlgorithm):
         :param load_path_or_dict: Path of a saved model, or what ``get_parameters`` gave
         :param exact_match: Whether the parameters of each module, and each of their parameters, have to be there
         :param device: Device on which the code should run
-        :raises ValueError: If one is NaN or infinite, unknown or missing, or an optimizer's state does not fit its parameters
+        :raises ValueError: If one is NaN or infinite, unknown or missing, or an optimizer's state does not fit its parameters;
+            of a file also if it is not whole
         :raises RuntimeError: If a network is another one
         """
+        if not isinstance(load_path_or_dict, dict):
+            params = read_parameters(load_path_or_dict, device)
+            try:
+                self.set_parameters(params, exact_match, device)
+            except Exception as error:
+                raise ParametersError(f"{named(load_path_or_dict)} cannot be loaded: {one_line(error)}") from error
+            return
         params = load_path_or_dict
-        if not isinstance(params, dict):
-            _, params, _ = load_from_zip_file(params, device=device, load_data=False)
         before = deepcopy(self.get_parameters())
         self._check_parameters(params)
         try:
@@ -119,7 +126,7 @@ class SavedAlgorithm(DiscoveringAlgorithm):
     def load(  # type: ignore[override]
         cls: type[SelfAlgorithm],
         path: str | pathlib.Path | io.BufferedIOBase,
-        env: GymEnv | None = None,
+        env: GymEnv | str | None = None,
         device: th.device | str = "auto",
         custom_objects: dict[str, Any] | None = None,
         print_system_info: bool = False,
@@ -137,8 +144,8 @@ class SavedAlgorithm(DiscoveringAlgorithm):
         of a version that pickled all.
 
         :param path: Path to the file (or a file-like) where to load the agent from
-        :param env: The new environment to run the loaded model on (can be None if you only need prediction from a trained
-            model)
+        :param env: The new environment to run the loaded model on, or its id (can be None if you only need prediction from a
+            trained model)
         :param device: Device on which the code should be run
         :param custom_objects: What is taken in place of the attributes of these names, which are not read
         :param print_system_info: Whether to print system info from the saved model and the current system info
@@ -151,6 +158,8 @@ class SavedAlgorithm(DiscoveringAlgorithm):
         if custom_objects is not None and not isinstance(custom_objects, dict):
             raise ValueError(f"custom_objects must be a dict or None, got {type(custom_objects).__name__}")
         given = {**(custom_objects or {}), **{name: value for name, value in kwargs.items() if name != "policy_kwargs"}}
+        # SB3's constructor takes an id, and its load does not
+        env = None if env is None else maybe_make_env(env, verbose=0)
         file = open_path(path, "r", suffix="zip")
         try:
             with errors_of(path, "cannot be loaded"):
@@ -215,7 +224,7 @@ class SavedAlgorithm(DiscoveringAlgorithm):
     def resume(
         cls: type[SelfAlgorithm],
         path: str | pathlib.Path,
-        env: GymEnv | None = None,
+        env: GymEnv | str | None = None,
         device: th.device | str = "auto",
         trusted: bool = False,
     ) -> SelfAlgorithm:
@@ -224,7 +233,7 @@ class SavedAlgorithm(DiscoveringAlgorithm):
         whole checkpoint. ``model.learn(model.remaining_timesteps, reset_num_timesteps=False)`` does the rest.
 
         :param path: Folder of checkpoints, one of them, or a zip file
-        :param env: Environment that is made as the first one was; None where :meth:`pretrain` goes on
+        :param env: Environment that is made as the first one was, or its id; None where :meth:`pretrain` goes on
         :param device: Device on which the code should be run
         :param trusted: Whether the files may name Python objects that could run code
         :return: The model
