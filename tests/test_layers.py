@@ -18,7 +18,7 @@ LAYERS = [
     {"acceleration.gradients"},
     {"acceleration.product_pass"},
     {"policies"},
-    {"acceleration.acting", "arguments", "saving.models"},
+    {"acceleration.acting", "arguments", "names", "saving.models"},
     {"causal", "offline", "diffusion"},
     {"checks", "divergence", "files", "acceleration.products", "acceleration.activations", "saving.plain", "saving.archives"},
     {"saving.numpy_pickles", "acceleration", "saving", "moved"},
