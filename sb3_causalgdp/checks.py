@@ -42,3 +42,23 @@ def first_not_finite_index(values: np.ndarray) -> tuple[int, ...]:
     :return: Index of the first that is not, one number for each axis, at least one
     """
     return tuple(np.argwhere(~(np.abs(np.atleast_1d(values)) <= LARGEST_FLOAT32))[0].tolist())
+
+
+def check_from_environment(values: Any, name: str, step: int) -> None:
+    """
+    :param values: What an environment gave: an array, or a dictionary of them
+    :param name: What it is
+    :param step: Number of environment steps before it
+    :raises ValueError: If one is NaN, or infinite in float32, with its index
+    """
+    if isinstance(values, dict):
+        for key, part in values.items():
+            check_from_environment(part, f"{name}[{key!r}]", step)
+    elif not fits_float32(np.asarray(values)):
+        values = np.atleast_1d(values)
+        where = first_not_finite_index(values)
+        what = f"{name} that is infinite in float32" if np.isfinite(values[where]) else f"NaN or infinite {name}"
+        raise ValueError(
+            f"The environment returned a {what} at step {step}, index {list(where)}: "
+            f"{values[where]}. Nothing of this step was stored; see VecCheckNan to find its origin."
+        )

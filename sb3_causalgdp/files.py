@@ -58,6 +58,19 @@ def saved_when_done(path: Any, suffix: str) -> Iterator[Any]:
         yield temporary
 
 
+def write_bytes(path: Any, suffix: str, content: bytes | memoryview) -> None:
+    """
+    :param path: File-like object or path, as for :func:`saved_when_done`
+    :param suffix: Of a path that has none, with its dot
+    :param content: What to write
+    """
+    with saved_when_done(path, suffix) as file:
+        if isinstance(file, Path):
+            file.write_bytes(content)
+        else:
+            file.write(content)
+
+
 @contextmanager
 def temporary_folder(folder: Path) -> Iterator[Path]:
     """

@@ -12,16 +12,18 @@ LAYERS = [
     {"callbacks.pictures"},
     {"__init__"},
     {"causalgdp"},
-    {"callbacks", "checkpoints"},
-    {"callbacks.world_model"},
-    {"losses", "callbacks.diagnostics", "structural", "acceleration.device_replay", "acceleration.cuda_graphs"},
-    {"acceleration.gradients"},
-    {"acceleration.product_pass"},
-    {"policies"},
-    {"acceleration.acting", "arguments", "names", "saving.models"},
+    {"saving.algorithm"},
+    {"callbacks", "checkpoints", "knowledge"},
+    {"callbacks.world_model", "updates"},
+    {"losses", "batches", "callbacks.diagnostics", "questions", "acceleration.fast_steps"},
+    {"policies", "acceleration.device_replay", "acceleration.cuda_graphs", "acceleration.gradients"},
+    {"prediction", "acceleration.product_pass"},
+    {"networks", "acceleration.acting"},
+    {"saving.policies", "acceleration.numpy_networks"},
+    {"arguments", "names", "saving.models"},
     {"causal", "offline", "diffusion"},
     {"checks", "divergence", "files", "acceleration.products", "acceleration.activations", "saving.plain", "saving.archives"},
-    {"saving.numpy_pickles", "acceleration", "saving", "moved"},
+    {"saving.numpy_pickles", "acceleration.switch", "acceleration", "saving", "moved"},
 ]
 WITHOUT_SB3 = {
     "causal",
@@ -35,6 +37,9 @@ WITHOUT_SB3 = {
     "acceleration.product_pass",
     "acceleration.activations",
     "acceleration.cuda_graphs",
+    "acceleration.fast_steps",
+    "acceleration.numpy_networks",
+    "acceleration.switch",
 }
 LEVELS = {part: level for level, parts in enumerate(LAYERS) for part in parts}
 FILES = sorted(PACKAGE.rglob("*.py"))
