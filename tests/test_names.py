@@ -1,9 +1,12 @@
+from pathlib import Path
+
 import gymnasium as gym
 import numpy as np
 import pytest
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecFrameStack, VecNormalize
 
+from sb3_causalgdp import CausalGDP
 from sb3_causalgdp.causal import TransitionVariables
 from sb3_causalgdp.names import found_names
 
@@ -124,3 +127,47 @@ def test_dict_observations_keep_their_keys():
             return {"position": observation}
 
     assert found_names(AsDict(gym.make("Pendulum-v1"))) == (None, ("torque",))
+
+
+@pytest.fixture(scope="module")
+def pendulum():
+    model = CausalGDP(
+        "MlpPolicy",
+        "Pendulum-v1",
+        learning_starts=100,
+        causal_refresh_freq=250,
+        policy_kwargs={"net_arch": [16], "world_model_net_arch": [16]},
+        seed=0,
+    )
+    return model.learn(260)
+
+
+def test_graphs_and_answers_have_the_environment_s_names(pendulum, tmp_path):
+    names = ("cos angle", "sin angle", "vel angle", "torque")
+    assert pendulum.causal_graph().variables.names[:4] == names
+    observation = np.array([1.0, 0.0, 0.0], dtype=np.float32)
+    by_name = pendulum.intervene(observation, [0.3], {"torque": 1.0, "vel angle'": 0.5})
+    by_index = pendulum.intervene(observation, [0.3], {"action[0]": 1.0, "obs[2]'": 0.5})
+    assert by_name.reward == by_index.reward
+    with pytest.raises(ValueError, match="did you mean 'torque'"):
+        pendulum.intervene(observation, [0.3], {"torqe": 1.0})
+    pendulum.save(tmp_path / "model.zip")
+    # Also where the environment is not there, and where it has other names
+    for env in (None, Named(gym.make("Pendulum-v1"))):
+        assert CausalGDP.load(tmp_path / "model.zip", env).causal_graph() == pendulum.causal_graph()
+
+
+def test_given_names_come_before_the_environment_s():
+    model = CausalGDP("MlpPolicy", "Pendulum-v1", state_names=["x", "y", "z"])
+    assert model.transition_variables.names[:4] == ("x", "y", "z", "torque")
+
+
+@pytest.mark.parametrize("names", [["x"], ["x", "x", "y"], "xyz", [1, 2, 3]])
+def test_wrong_names_are_refused(names):
+    with pytest.raises(ValueError, match="state_names must be"):
+        CausalGDP("MlpPolicy", "Pendulum-v1", state_names=names)
+
+
+def test_models_that_were_trained_without_names_keep_their_indices():
+    model = CausalGDP.load(Path(__file__).parent / "data" / "model_of_0_1.zip", make_vec_env("Pendulum-v1"))
+    assert model.transition_variables.names[:4] == ("obs[0]", "obs[1]", "obs[2]", "action[0]")
