@@ -44,6 +44,7 @@ MOST_THREADS = 1_024
 WIDEST_LAYER = 65_536
 MOST_LAYERS = 100
 MOST_CRITICS = 100
+MOST_NAMES = 1_000_000
 LARGEST_NOISE = 10.0
 ACTION_PRECISION = 1e-3  # of an action's half range
 
@@ -179,13 +180,16 @@ def schedule(kind: Kind) -> Kind:
     return Kind(f"{kind.accepted}, or a function that gives such numbers for the progress remaining (from 1 to 0)", read)
 
 
-def sequence(kind: Kind, words: str, shortest: int = 0, longest: int = MOST_LAYERS, equal: bool = False) -> Kind:
+def sequence(
+    kind: Kind, words: str, shortest: int = 0, longest: int = MOST_LAYERS, equal: bool = False, different: bool = False
+) -> Kind:
     """
     :param kind: What each element has to be
     :param words: What the sequence is called
     :param shortest: The smallest length
     :param longest: The largest length
     :param equal: Whether all elements have to be the same
+    :param different: Whether none may be the same as another
     :return: Lists, also tuples and arrays, which become lists
     """
 
@@ -193,7 +197,8 @@ def sequence(kind: Kind, words: str, shortest: int = 0, longest: int = MOST_LAYE
         if not isinstance(value, (list, tuple, np.ndarray)) or not shortest <= len(value) <= longest:
             raise NotAcceptedError
         elements = [kind.read(element) for element in value]
-        if equal and len(set(elements)) > 1:
+        n_different = len(set(map(str, elements)))
+        if (equal and n_different > 1) or (different and n_different < len(elements)):
             raise NotAcceptedError
         return elements
 
@@ -259,6 +264,7 @@ def _needs_no_closure(value: type) -> bool:
 
 STEPS = integer(1, MOST_STEPS)
 SHARE = number(0.0, 1.0)
+NAMES = sequence(TEXT, "a list of names, each another one", 1, MOST_NAMES, different=True)
 WEIGHT = number(0.0, LARGEST_WEIGHT)
 RATE = schedule(WEIGHT)
 LAYERS_ACCEPTED = f"a list of at most {MOST_LAYERS} layer sizes from 1 to {_text(WIDEST_LAYER)}"
@@ -323,6 +329,8 @@ CONSTRUCTOR_ARGUMENTS: dict[str, Kind] = {
     "causal_half_life": number(1.0, LARGEST_NUMBER) | NONE,
     "causal_window": integer(8, MOST_STEPS) | NONE,
     "sample_masks": FLAG,
+    "state_names": NAMES | NONE,
+    "action_names": NAMES | NONE,
     "offline_dataset": PATH | NONE,
     "pretrain_steps": integer(0, MOST_PRETRAIN_STEPS),
     "offline_fraction": schedule(SHARE),

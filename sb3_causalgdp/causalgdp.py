@@ -119,6 +119,9 @@ class CausalGDP(AskedAlgorithm, SavedAlgorithm):
     :param sample_masks: How the world model trains on its masks. True: as probabilities, which edges are there is drawn anew
         for each batch, so that an improbable edge carries little. False: as factors of the inputs, which what is learned
         behind them makes up for unless they are 0
+    :param state_names: Names of the observation's components in graphs, pictures and answers; None takes the environment's own
+        (see :func:`~sb3_causalgdp.names.found_names`), or where it has none keys and indices
+    :param action_names: The same for the components of the actions
     :param offline_dataset: Id of a Minari dataset, or path of a saved replay buffer or of arrays, that is preloaded when
         training starts and no transitions are there; so a loaded model, whose buffer is empty, loads it again
     :param pretrain_steps: Gradient steps of :meth:`pretrain` before the first step of ``learn()``; those that were made
@@ -215,6 +218,8 @@ class CausalGDP(AskedAlgorithm, SavedAlgorithm):
         causal_half_life: float | None = None,
         causal_window: int | None = None,
         sample_masks: bool = True,
+        state_names: Sequence[str] | None = None,
+        action_names: Sequence[str] | None = None,
         offline_dataset: str | None = None,
         pretrain_steps: int = 0,
         offline_fraction: float | Schedule = 0.5,
@@ -299,6 +304,8 @@ class CausalGDP(AskedAlgorithm, SavedAlgorithm):
         self.causal_half_life = causal_half_life
         self.causal_window = causal_window
         self.sample_masks = sample_masks
+        self.state_names = state_names
+        self.action_names = action_names
         self.compile = compile
         self.cuda_graph = cuda_graph
         self.torch_threads = torch_threads

@@ -2,7 +2,7 @@
 
 import io
 import pathlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
 
 import torch as th
@@ -10,6 +10,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 
 from sb3_causalgdp.causal import CausalGraph, Statistics, TransitionVariables, make_discovery, make_statistics
 from sb3_causalgdp.causal.world_model import MaskedWorldModel
+from sb3_causalgdp.names import found_names
 from sb3_causalgdp.offline.algorithm import OfflineToOnlineAlgorithm
 from sb3_causalgdp.policies import CausalGDPPolicy, DiffusionActor
 from sb3_causalgdp.updates import Updates
@@ -32,6 +33,8 @@ class DiscoveringAlgorithm(OfflineToOnlineAlgorithm):
     causal_discovery_kwargs: dict[str, Any]
     causal_half_life: float | None
     causal_window: int | None
+    state_names: Sequence[str] | None
+    action_names: Sequence[str] | None
     _updates: Updates
 
     GRAPHS_IN_HISTORY = 32
@@ -77,8 +80,7 @@ class DiscoveringAlgorithm(OfflineToOnlineAlgorithm):
             self.discovery = make_discovery(self.causal_discovery, **self.causal_discovery_kwargs)
         except (TypeError, ValueError) as error:
             raise ValueError(f"causal_discovery_kwargs: {error}") from error
-        action_names = tuple(f"action[{index}]" for index in range(self.actor.action_dim))
-        self.transition_variables = TransitionVariables(self.policy.state_names(), action_names)
+        self.transition_variables = self._named_variables()
         method = self.causal_discovery
         # A callable that was saved is not the same object when it is loaded
         name = method if isinstance(method, str) else getattr(method, "__qualname__", type(method).__qualname__)
@@ -90,6 +92,22 @@ class DiscoveringAlgorithm(OfflineToOnlineAlgorithm):
             self._statistics_made_by = made_by
             self._fed_position = self._fed_offline_position = 0
             self._fed_marks = []
+
+    def _named_variables(self) -> TransitionVariables:
+        """By the names that were given, the environment's own, or indices."""
+        if self._statistics_made_by is None:
+            # A loaded model keeps the names under which it was trained
+            found = found_names(self.env)
+            self.state_names = self.state_names or (None if self.policy.has_image_state else found[0])
+            self.action_names = self.action_names or found[1]
+        states, actions = self.policy.state_names(), tuple(f"action[{index}]" for index in range(self.actor.action_dim))
+        for argument, indices in (("state_names", states), ("action_names", actions)):
+            names = getattr(self, argument)
+            if names is not None and len(names) != len(indices):
+                raise ValueError(f"{argument} must be {len(indices)} names, got {len(names)}: {list(names)}")
+        # Users may say either
+        self._indices = TransitionVariables(states, actions)
+        return TransitionVariables(tuple(self.state_names or states), tuple(self.action_names or actions))
 
     def _new_statistics(self) -> Statistics:
         try:

@@ -28,6 +28,7 @@ class AskedAlgorithm(OfflineToOnlineAlgorithm):
 
     policy: CausalGDPPolicy
     transition_variables: TransitionVariables
+    _indices: TransitionVariables
     _causal_graph: CausalGraph | None
 
     def causal_graph(self) -> CausalGraph:
@@ -57,7 +58,7 @@ class AskedAlgorithm(OfflineToOnlineAlgorithm):
     ) -> InterventionalDistribution:
         """
         The distribution of the next state and of the reward under do(...), like
-        ``model.intervene(obs, action, {"action[0]": 0.5, "obs[3]'": 1.0})``.
+        ``model.intervene(obs, action, {"torque": 0.5, "vel angle'": 1.0})``; ``action[0]`` is understood, too.
 
         :param observation: One observation or a batch, as the environment gives it: not normalised by ``VecNormalize``
         :param action: The action of each, within the bounds of the action space
@@ -66,7 +67,8 @@ class AskedAlgorithm(OfflineToOnlineAlgorithm):
         :return: See :meth:`~sb3_causalgdp.causal.StructuralModel.intervene`
         """
         model = self.structural_model()
-        return model.intervene(self._states_of(observation), actions_of(self.policy, action), interventions, n_samples)
+        states, actions = self._states_of(observation), actions_of(self.policy, action)
+        return model.intervene(states, actions, self._by_name(interventions), n_samples)
 
     def effect_of_actions(
         self,
@@ -93,7 +95,7 @@ class AskedAlgorithm(OfflineToOnlineAlgorithm):
     ) -> Counterfactual:
         """
         What would have happened in a recorded episode had other actions been taken, under the same noise, like
-        ``model.counterfactual((observations, actions, rewards), {"action[0]": 0.0})``.
+        ``model.counterfactual((observations, actions, rewards), {"torque": 0.0})``.
 
         :param trajectory: T + 1 observations, T actions and T rewards of one episode, as the environment gives them: not
             normalised by ``VecNormalize``
@@ -107,7 +109,14 @@ class AskedAlgorithm(OfflineToOnlineAlgorithm):
         observations, actions, rewards = trajectory
         recorded = (self._states_of(observations), actions_of(self.policy, actions), rewards)
         policy = StatePolicy(self.policy, self._vec_normalize_env) if follow_policy else None
-        return model.counterfactual(recorded, changes, policy)
+        return model.counterfactual(recorded, self._by_name(changes), policy)
+
+    def _by_name(self, values: Mapping[str, Any]) -> dict[str, Any]:
+        """What has the index of a variable gets its name."""
+        names = dict(zip(self._indices.names, self.transition_variables.names, strict=True))
+        return {
+            name if name in self.transition_variables.names else names.get(name, name): value for name, value in values.items()
+        }
 
     def _states_of(self, observation: Any) -> np.ndarray:
         return states_of(self.policy, observation, self._vec_normalize_env)

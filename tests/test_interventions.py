@@ -131,7 +131,7 @@ def test_the_actions_have_the_bounds_of_their_space(pendulum):
     action = np.array([[-2.0], [0.3], [2.0]], dtype=np.float32)
     scaled = structural._model_action(action.astype(np.float64)).numpy()
     np.testing.assert_allclose(scaled, pendulum.policy.scale_action(action), atol=1e-6)
-    with pytest.raises(ValueError, match=r"action\[0\] must be in \[-2, 2\], got 2.5"):
+    with pytest.raises(ValueError, match=r"torque must be in \[-2, 2\], got 2.5"):
         pendulum.intervene(np.zeros(3), [0.0], {TORQUE: 2.5})
     with pytest.raises(ValueError, match=r"Actions must have the shape \(1,\) or \(batch, 1\), got \(3,\)"):
         pendulum.intervene(np.zeros((3, 3)), [0.0, 0.0, 0.0], {})
@@ -245,7 +245,7 @@ def test_dictionaries_of_observations():
     unchanged = model.counterfactual(recorded, {})
     np.testing.assert_array_equal(unchanged.states[:, names.index("speed[0]")], [o["speed"][0] for o in recorded[0]])
     np.testing.assert_array_equal(unchanged.states[:, names.index("side[1]")], [o["side"] for o in recorded[0]])
-    with pytest.raises(ValueError, match=r"action\[0\] must be in \[-2, 2\], got -3"):
+    with pytest.raises(ValueError, match=r"torque must be in \[-2, 2\], got -3"):
         model.counterfactual(recorded, {TORQUE: -3.0})
     with pytest.raises(ValueError, match="The policy cannot act in predicted states"):
         model.counterfactual(recorded, {}, follow_policy=True)

@@ -20,7 +20,7 @@ LAYERS = [
     {"prediction", "acceleration.product_pass"},
     {"networks", "acceleration.acting"},
     {"saving.policies", "acceleration.numpy_networks"},
-    {"arguments", "saving.models"},
+    {"arguments", "names", "saving.models"},
     {"causal", "offline", "diffusion"},
     {
         "checks",

@@ -1,5 +1,6 @@
 """Interventions, effects and counterfactuals on the masked world model, in the environment's own units."""
 
+import difflib
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -253,7 +254,9 @@ class StructuralModel:
         if unknown:
             shown = list(known[: self.MAX_NAMES_IN_MESSAGE])
             more = "" if len(shown) == len(known) else f" and {len(known) - len(shown)} more"
-            raise ValueError(f"Unknown variables {unknown}: known are {shown}{more}")
+            close = difflib.get_close_matches(unknown[0], known, n=1)
+            meant = f"did you mean {close[0]!r}? Known" if close else "known"
+            raise ValueError(f"Unknown variables {unknown}: {meant} are {shown}{more}")
 
     # Interventions ----------------------------------------------------------------------------------------------------------
 
