@@ -99,7 +99,7 @@ class CausalWorldModelCallback(BaseCallback):
         self.logger.record("causal/change", graph.change_since(before))
         self.logger.record("causal/refresh_seconds", time.perf_counter() - start)
         if self.verbose >= 1:
-            print(f"Causal graph at {model.num_timesteps} steps from {graph.n_samples} transitions: {count_of_edges(graph)}")
+            print(f"Causal graph at {model.num_timesteps} steps: {count_of_edges(graph)}, from {graph.n_samples} transitions")
         self._log_diagnostics()
 
     def _say_too_few(self, n_samples: int, needed: int) -> None:
