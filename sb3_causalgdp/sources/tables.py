@@ -68,6 +68,8 @@ class Table:
         parts = {role: self._numbers(columns, names) for role, names in roles.items()}
         order = _Order(self.name, columns, episode, time)
         rows, following, is_last = order.transitions(lag, in_row=next_states is not None)
+        if len(rows) == 0:
+            raise ValueError(f"{self.name} holds no transition: episodes need more than {lag} rows")
         after, place = ("next_states", rows) if next_states is not None else ("states", following)
         if order.n_gaps > 0:
             self._remark(f"no transitions over {order.n_gaps} gaps in {time!r}")
@@ -87,7 +89,7 @@ class Table:
         # What follows a row that was left out does not follow the row before it
         self.is_last = (is_last | ~np.append(whole[1:], True))[whole]
         if len(self.rewards) == 0:
-            raise ValueError(f"{self.name} holds no transition: episodes need more than {lag} rows")
+            raise ValueError(f"{self.name} holds no transition without a missing value")
 
     def __len__(self) -> int:
         return len(self.rewards)
@@ -191,7 +193,7 @@ def _as_numbers(table: str, name: str, values: np.ndarray) -> tuple[np.ndarray, 
 
 
 def _is_missing(value: Any) -> bool:
-    return value is None or value != value or str(value) in ("<NA>", "NaT")
+    return value is None or str(value) in ("<NA>", "NaT", "nan")
 
 
 class _Order:
