@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sb3_causalgdp.causal import description
-from sb3_causalgdp.causal.drawing import PLOTS_HINT, picture
+from sb3_causalgdp.causal.drawing import PLOTS_HINT, frame_of, picture
 from sb3_causalgdp.causal.edges import EDGE_PROBABILITY, Edge, GraphDiff, strongest_in_rows
 from sb3_causalgdp.causal.variables import TransitionVariables
 from sb3_causalgdp.files import replaced_when_done
@@ -293,11 +293,7 @@ class CausalGraph:
             the fields of :class:`Edge`
         :raises ImportError: when pandas is missing
         """
-        try:
-            import pandas as pd
-        except ImportError as error:
-            raise ImportError("pandas is needed for this: pip install pandas") from error
-        return pd.DataFrame(self._edges(np.ones_like(self.masks)), columns=list(Edge._fields))
+        return frame_of(self._edges(np.ones_like(self.masks)), Edge._fields)
 
     def to_networkx(self, threshold: float = EDGE_PROBABILITY) -> "nx.DiGraph":
         """

@@ -3,6 +3,7 @@
 from sb3_causalgdp.causal.graph import PLOTS_HINT
 
 try:
+    from sb3_causalgdp.causal.plots.answers import plot_counterfactual, plot_intervention
     from sb3_causalgdp.causal.plots.effects import plot_action_effects
     from sb3_causalgdp.causal.plots.graphs import plot_causal_graph
     from sb3_causalgdp.causal.plots.heat_maps import plot_heat_map
@@ -19,7 +20,9 @@ __all__ = [
     "animate_history",
     "plot_action_effects",
     "plot_causal_graph",
+    "plot_counterfactual",
     "plot_graph",
     "plot_heat_map",
     "plot_history",
+    "plot_intervention",
 ]
