@@ -56,14 +56,12 @@ def plot_intervention(
     axes.set_ylim(len(shown) - 0.5, -0.5)
     axes.axvline(0.0, color="black", linewidth=0.8)
     axes.set_xlabel(
-        "change, in running standard deviations; bands: two standard deviations of the outcome", fontsize=FONT_SIZE
+        "change, in running standard deviations\n(bands: two standard deviations of the outcome)", fontsize=FONT_SIZE
     )
     remark = "" if len(shown) == len(names) else f" (the {len(shown)} of {len(names)} outcomes that change most)"
     axes.set_title(f"What the intervention changes{remark}", fontsize=FONT_SIZE + 2)
     _finish(axes)
-    axes.legend(
-        loc="upper center", bbox_to_anchor=(0.5, -0.2 * 2.5 / height - 0.1), ncols=2, frameon=False, fontsize=FONT_SIZE
-    )
+    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.75 / (height - 1.4)), ncols=2, frameon=False, fontsize=FONT_SIZE)
     save_figure(figure, path)
     return figure
 
@@ -110,9 +108,8 @@ def plot_counterfactual(
         _finish(axes)
     panels[-1].set_xlabel("step", fontsize=FONT_SIZE)
     difference = answer.rewards.sum() - answer.recorded.rewards.sum()
-    figure.suptitle(
-        f"Return {answer.recorded.rewards.sum():.4g} recorded, {difference:+.4g} counterfactual", fontsize=FONT_SIZE + 2
-    )
+    returns = f"{answer.recorded.rewards.sum():.4g} recorded, {answer.rewards.sum():.4g} counterfactual ({difference:+.3g})"
+    figure.suptitle(f"Return: {returns}", fontsize=FONT_SIZE + 2)
     handles, labels = panels[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=3, frameon=False, fontsize=FONT_SIZE)
     save_figure(figure, path)
