@@ -61,7 +61,7 @@ def plot_intervention(
     remark = "" if len(shown) == len(names) else f" (the {len(shown)} of {len(names)} outcomes that change most)"
     axes.set_title(f"What the intervention changes{remark}", fontsize=FONT_SIZE + 2)
     _finish(axes)
-    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.75 / (height - 1.4)), ncols=2, frameon=False, fontsize=FONT_SIZE)
+    figure.legend(loc="outside lower center", ncols=2, frameon=False, fontsize=FONT_SIZE)
     save_figure(figure, path)
     return figure
 

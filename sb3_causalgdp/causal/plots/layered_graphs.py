@@ -138,7 +138,7 @@ def _edge_legend(edges: Sequence[Edge], largest: float, is_grouped: bool) -> lis
     grey = "0.45"
     handles = [line(0.6, UNSIGNED, "effect")] if is_grouped else []
     handles += [] if is_grouped else [line(0.6, POSITIVE, "positive"), line(0.6, NEGATIVE, "negative")]
-    handles += [line(weight, grey, f"{weight * largest:.2g} std") for weight in (0.1, 1.0)]
+    handles += [line(weight, grey, f"{weight * largest:.1g} std") for weight in (0.1, 1.0)]
     if any(edge.mask <= EDGE_PROBABILITY for edge in edges):
         handles.append(line(0.3, grey, "probability below 0.5", DASHES))
     return handles
