@@ -210,8 +210,10 @@ class StructuralModel:
         else:
             rewards, reward_stds = self._reward_by_sampling(next_states, stds, actions, n_samples, seed)
         without = self.intervene(observation, action, {}, n_samples, seed) if interventions else None
-        parts = [values[0] if is_single else values for values in (next_states, stds, rewards, reward_stds)]
-        return InterventionalDistribution(*parts, self.variables, self._running_std(), without)
+        if is_single:
+            next_states, stds, rewards, reward_stds = (values[0] for values in (next_states, stds, rewards, reward_stds))
+        running_std = self._running_std()
+        return InterventionalDistribution(next_states, stds, rewards, reward_stds, self.variables, running_std, without)
 
     def _running_std(self) -> np.ndarray:
         """Of the states and, last, of the reward, in the environment's units, shape ``(n + 1,)``."""

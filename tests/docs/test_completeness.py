@@ -50,7 +50,7 @@ def public_names(file):
 
 PUBLIC_MODULES = [
     *(file for file in sorted(PACKAGE.rglob("__init__.py")) if file.read_text(encoding="utf-8").strip()),
-    *(PACKAGE / f"{name}.py" for name in ("callbacks", "diagnostics", "losses", "pictures", "policies", "structural")),
+    *(PACKAGE / f"{name}.py" for name in ("callbacks/diagnostics", "callbacks/pictures", "losses", "policies", "structural")),
 ]
 
 
