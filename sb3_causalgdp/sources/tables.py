@@ -20,7 +20,7 @@ class Table:
     Transitions from a table: row t holds the state, the action that was taken there and the reward that it brought; the next
     state is the state ``lag`` rows later in the same episode.
 
-    Text and categories become a column of 0 and 1 for each value but the most frequent one. :attr:`remarks` says so, and what
+    Text and categories become a column of 0 and 1 for each value but the most frequent one. ``remarks`` says so, and what
     else was done.
 
     :param source: A data frame of pandas or polars, an Arrow table, a mapping of arrays, an array of shape (N, m), or the path
