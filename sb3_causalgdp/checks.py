@@ -26,6 +26,19 @@ def is_finite(values: np.ndarray) -> bool:
     return values.dtype.kind != "f" or bool(np.isfinite(values).all())
 
 
+def many_are_finite(values: np.ndarray) -> bool:
+    """
+    As :func:`is_finite`, at half the cost for thousands of numbers: only where all are finite, their sum is, or it overflows.
+
+    :param values: Of any type and shape
+    :return: Whether all are finite
+    """
+    if values.dtype.kind != "f":
+        return True
+    with np.errstate(over="ignore", invalid="ignore"):
+        return bool(np.isfinite(values.sum())) or is_finite(values)
+
+
 def fits_float32(values: np.ndarray) -> bool:
     """
     :param values: Of any type and shape
@@ -42,3 +55,23 @@ def first_not_finite_index(values: np.ndarray) -> tuple[int, ...]:
     :return: Index of the first that is not, one number for each axis, at least one
     """
     return tuple(np.argwhere(~(np.abs(np.atleast_1d(values)) <= LARGEST_FLOAT32))[0].tolist())
+
+
+def check_from_environment(values: Any, name: str, step: int) -> None:
+    """
+    :param values: What an environment gave: an array, or a dictionary of them
+    :param name: What it is
+    :param step: Number of environment steps before it
+    :raises ValueError: If one is NaN, or infinite in float32, with its index
+    """
+    if isinstance(values, dict):
+        for key, part in values.items():
+            check_from_environment(part, f"{name}[{key!r}]", step)
+    elif not fits_float32(np.asarray(values)):
+        values = np.atleast_1d(values)
+        where = first_not_finite_index(values)
+        what = f"{name} that is infinite in float32" if np.isfinite(values[where]) else f"NaN or infinite {name}"
+        raise ValueError(
+            f"The environment returned a {what} at step {step}, index {list(where)}: "
+            f"{values[where]}. Nothing of this step was stored; see VecCheckNan to find its origin."
+        )

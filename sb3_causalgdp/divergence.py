@@ -1,7 +1,7 @@
 """What is no longer a number, said by name."""
 
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import torch as th
@@ -107,3 +107,24 @@ def check_optimizer_state(optimizer: th.optim.Optimizer, state: Mapping[str, Any
                 raise ParametersError(
                     f"{name}.state.{index}.{key} has the shape {tuple(value.shape)}, its parameter {tuple(parameter.shape)}"
                 )
+
+
+def check_losses(losses: Sequence[tuple[str, float]], last_step: int, delays: Mapping[str, int], delay: int) -> None:
+    """
+    :param losses: Of some gradient steps, with their names; each step has one of the critics
+    :param last_step: Number of gradient steps up to the last of these
+    :param delays: A loss of this name comes once every so many steps
+    :param delay: The same for all other names
+    :raises TrainingDivergedError: With the first that is NaN or infinite
+    """
+    first = last_step - sum(name == "critic_loss" for name, _ in losses) + 1
+    steps: dict[str, Iterator[int]] = {}
+    found = []
+    for place, (name, value) in enumerate(losses):
+        every = delays.get(name, delay)
+        step = next(steps.setdefault(name, (step for step in range(first, last_step + 1) if step % every == 0)))
+        if not math.isfinite(value):
+            found.append((step, place, name, value))
+    if found:
+        step, _, name, value = min(found)
+        raise TrainingDivergedError(name, value, step)

@@ -25,11 +25,12 @@ def replaced_when_done(path: str | os.PathLike[str]) -> Iterator[Path]:
     Temporaries that a killed process left for the same file are removed.
 
     :param path: File to write; its folder is created
+    :raises OSError: If it cannot be written; the error names ``path``, and not the temporary file
     """
     target = Path(os.path.realpath(path))
     target.parent.mkdir(parents=True, exist_ok=True)
     remove_stale(target.parent, target.name)
-    with _locked_temporary(target, is_folder=False) as temporary:
+    with errors_about(path), _locked_temporary(target, is_folder=False) as temporary:
         try:
             yield temporary
             if target.exists():
@@ -58,6 +59,19 @@ def saved_when_done(path: Any, suffix: str) -> Iterator[Any]:
         yield temporary
 
 
+def write_bytes(path: Any, suffix: str, content: bytes | memoryview) -> None:
+    """
+    :param path: File-like object or path, as for :func:`saved_when_done`
+    :param suffix: Of a path that has none, with its dot
+    :param content: What to write
+    """
+    with saved_when_done(path, suffix) as file:
+        if isinstance(file, Path):
+            file.write_bytes(content)
+        else:
+            file.write(content)
+
+
 @contextmanager
 def temporary_folder(folder: Path) -> Iterator[Path]:
     """
@@ -67,7 +81,7 @@ def temporary_folder(folder: Path) -> Iterator[Path]:
     """
     folder.mkdir(parents=True, exist_ok=True)
     remove_stale(folder)
-    with _locked_temporary(folder / "folder", is_folder=True) as temporary:
+    with errors_about(folder), _locked_temporary(folder / "folder", is_folder=True) as temporary:
         try:
             yield temporary
         finally:
@@ -86,11 +100,26 @@ def renamed_when_done(path: str | os.PathLike[str]) -> Iterator[Path]:
     target = Path(path).absolute()
     if target.exists():
         raise FileExistsError(f"{target} is there already")
-    with temporary_folder(target.parent) as temporary:
+    with temporary_folder(target.parent) as temporary, errors_about(path):
         filled = temporary / target.name
         filled.mkdir()
         yield filled
         move_folder(filled, target)
+
+
+@contextmanager
+def errors_about(path: str | os.PathLike[str]) -> Iterator[None]:
+    """
+    Errors of the system, as on a full disk, name what was to be written in place of a temporary file, or of nothing.
+
+    :param path: What is to be written
+    """
+    try:
+        yield
+    except OSError as error:
+        if error.errno is None or (error.filename is not None and MARK not in str(error.filename)):
+            raise
+        raise OSError(error.errno, error.strerror, os.fspath(path)) from error
 
 
 def move_folder(source: Path, target: Path) -> None:

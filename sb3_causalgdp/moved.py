@@ -27,6 +27,7 @@ _NEW_NAMES = {
     **{f"causal.{module}": f"causal.statistics.{module}" for module in _STATISTICS.split()},
     **{f"causal.{old}": f"causal.plots.{new}" for old, new in _PLOTS.items()},
     "saved": "saving.models",
+    "structural": "questions",
 }
 MOVED = {f"{__package__}.{old}": f"{__package__}.{new}" for old, new in _NEW_NAMES.items()}
 """New full names of modules by their old ones."""

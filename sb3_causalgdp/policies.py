@@ -1,257 +1,39 @@
-"""Diffusion actor, double critics, their targets and the causal world model, as one SB3 policy."""
+"""Networks of CausalGDP, what they are fed and how they are guided, as one SB3 policy."""
 
-import io
-import pathlib
-import pickle
-from collections.abc import Mapping, Sequence
-from typing import Any, BinaryIO, TypeVar
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.policies import BaseModel, BasePolicy, ContinuousCritic
-from stable_baselines3.common.preprocessing import get_action_dim, is_image_space, preprocess_obs
+from stable_baselines3.common.policies import ContinuousCritic
+from stable_baselines3.common.preprocessing import is_image_space, preprocess_obs
 from stable_baselines3.common.torch_layers import (
     BaseFeaturesExtractor,
     CombinedExtractor,
     FlattenExtractor,
     NatureCNN,
-    create_mlp,
     get_actor_critic_arch,
 )
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
-from stable_baselines3.common.utils import get_device
 from torch import nn
 
 from sb3_causalgdp.acceleration.acting import NumpyActing
 from sb3_causalgdp.acceleration.activations import fast
-from sb3_causalgdp.acceleration.products import make_layers_fast
 from sb3_causalgdp.arguments import POLICY_ARGUMENTS, check_arguments, check_keywords
 from sb3_causalgdp.causal import CausalGuidance, LinearisedGuidance, MaskedWorldModel, ReturnTarget, RewardTarget
 from sb3_causalgdp.causal.guidance import OutcomeTarget
-from sb3_causalgdp.checks import first_not_finite_index, fits_float32, is_finite
-from sb3_causalgdp.diffusion import Guidance, GuidanceRule, MLPDenoiser, NoiseSchedule, sample
-from sb3_causalgdp.diffusion.samplers import bind, check_sampler
-from sb3_causalgdp.divergence import TrainingDivergedError, first_not_finite
-from sb3_causalgdp.files import saved_when_done
-from sb3_causalgdp.saving.archives import TRUST, FileError, errors_of, named, opened, size_of
-from sb3_causalgdp.saving.models import BLOCK, CONTENT, KNOWN, check_limits, check_tensor_file, plain_entries
-from sb3_causalgdp.saving.plain import Known, decoded, read_json
-
-ACTIVATIONS: dict[str, type[nn.Module]] = {
-    "mish": nn.Mish,
-    "silu": nn.SiLU,
-    "relu": nn.ReLU,
-    "tanh": nn.Tanh,
-    "elu": nn.ELU,
-    "gelu": nn.GELU,
-}
-
-SelfPolicy = TypeVar("SelfPolicy", bound="CausalGDPPolicy")
-SelfNetwork = TypeVar("SelfNetwork", bound="_PickledAlone")
+from sb3_causalgdp.checks import is_finite
+from sb3_causalgdp.diffusion import GuidanceRule
+from sb3_causalgdp.divergence import TrainingDivergedError
+from sb3_causalgdp.networks import Critic, DiffusionActor, activation_class, q_values
+from sb3_causalgdp.prediction import act, check_observation, fixed_noise
+from sb3_causalgdp.saving.models import KNOWN
+from sb3_causalgdp.saving.plain import Known
+from sb3_causalgdp.saving.policies import SavedPolicy
 
 
-def activation_class(activation_fn: str | type[nn.Module]) -> type[nn.Module]:
-    """
-    :param activation_fn: Class of the activation, or its name in lower case
-    :return: The class
-    :raises ValueError: If the name is unknown
-    """
-    if not isinstance(activation_fn, str):
-        return activation_fn
-    if activation_fn.lower() not in ACTIVATIONS:
-        raise ValueError(
-            f"Unknown activation_fn {activation_fn!r}: it must be a torch.nn class or one of {sorted(ACTIVATIONS)}"
-        )
-    return ACTIVATIONS[activation_fn.lower()]
-
-
-def q_values(
-    critic: ContinuousCritic, features: th.Tensor, actions: th.Tensor, networks: slice = slice(None)
-) -> list[th.Tensor]:
-    """
-    What each critic network says of features that are known already; the critic itself extracts them anew.
-
-    :param critic: The critics
-    :param features: Shape ``(batch, features_dim)``
-    :param actions: In [-1, 1], shape ``(batch, d)``
-    :param networks: Which of the networks, all by default
-    :return: One tensor of shape ``(batch, 1)`` for each network
-    """
-    inputs = th.cat([features, actions], dim=1)
-    return [network(inputs) for network in critic.q_networks[networks]]
-
-
-class _PickledAlone(BaseModel):
-    """A network that SB3 saves as a pickle, because it holds another one; a whole policy needs none."""
-
-    @classmethod
-    def load(  # type: ignore[override]
-        cls: type[SelfNetwork], path: Any, device: th.device | str = "auto", *, trusted: bool = False
-    ) -> SelfNetwork:
-        """
-        Load a network that was saved alone.
-
-        :param path: File, or file-like object
-        :param device: Device on which the network should be
-        :param trusted: Whether the file may bring Python objects that could run code
-        :return: The network
-        :raises ValueError: If the file is not trusted
-        """
-        if not trusted:
-            raise FileError(
-                f"{named(path)} is a pickle, which could run code: {TRUST}, or save the whole policy, which is none"
-            )
-        return super().load(path, device)
-
-
-class Critic(_PickledAlone, ContinuousCritic):
-    """
-    SB3's critics, with layer normalisation between each hidden layer and its activation if asked for.
-
-    :param layer_norm: Whether to normalise the hidden layers
-    :param kwargs: Keyword arguments of SB3's critics
-    """
-
-    def __init__(self, layer_norm: bool = False, **kwargs: Any) -> None:
-        super().__init__(**kwargs)
-        n_inputs = kwargs["features_dim"] + get_action_dim(kwargs["action_space"])
-        for index, network in enumerate(self.q_networks):
-            if layer_norm:
-                norms: list[type[nn.Module]] = [nn.LayerNorm]
-                layers = create_mlp(n_inputs, 1, kwargs["net_arch"], kwargs["activation_fn"], post_linear_modules=norms)
-                self.q_networks[index] = network = nn.Sequential(*layers)
-                setattr(self, f"qf{index}", network)
-            make_layers_fast(network)
-
-
-class DiffusionActor(_PickledAlone, BasePolicy):
-    """
-    Diffusion policy: denoises actions, conditioned on the features of the observation.
-
-    :param observation_space: Observation space
-    :param action_space: Action space
-    :param net_arch: Hidden layers of the denoiser
-    :param features_extractor: Network that turns observations into features
-    :param features_dim: Number of features
-    :param activation_fn: Activation class
-    :param normalize_images: Whether to divide images by 255
-    :param diffusion_steps: Number of diffusion steps K
-    :param noise_schedule: ``vp``, ``linear`` or ``cosine``
-    :param sampler: ``ddpm`` or ``ddim``
-    :param ddim_eta: Noise of DDIM, in [0, 1]
-    """
-
-    # Noise's share of the variance from which an action is adapted to a state near by
-    ADAPTING_NOISE = 0.1
-
-    def __init__(
-        self,
-        observation_space: spaces.Space,
-        action_space: spaces.Box,
-        net_arch: list[int],
-        features_extractor: BaseFeaturesExtractor,
-        features_dim: int,
-        activation_fn: type[nn.Module] = nn.Mish,
-        normalize_images: bool = True,
-        diffusion_steps: int = 5,
-        noise_schedule: str = "vp",
-        sampler: str = "ddpm",
-        ddim_eta: float = 0.0,
-    ) -> None:
-        super().__init__(
-            observation_space,
-            action_space,
-            features_extractor=features_extractor,
-            normalize_images=normalize_images,
-            squash_output=True,
-        )
-        check_sampler(sampler, ddim_eta)
-        self.action_dim = get_action_dim(action_space)
-        self.net_arch = net_arch
-        self.features_dim = features_dim
-        self.activation_fn = activation_fn
-        self.sampler = sampler
-        self.ddim_eta = ddim_eta
-        self.schedule = NoiseSchedule(noise_schedule, diffusion_steps)
-        noisy_enough = (i for i, signal in enumerate(self.schedule.alpha_bar_list) if 1.0 - signal >= self.ADAPTING_NOISE)
-        self.adapting_step = next(noisy_enough, self.schedule.n_steps - 1)
-        self.denoiser = MLPDenoiser(self.action_dim, features_dim, diffusion_steps, net_arch, activation_fn)
-
-    def _get_constructor_parameters(self) -> dict[str, Any]:
-        data = super()._get_constructor_parameters()
-        data.update(
-            net_arch=self.net_arch,
-            features_dim=self.features_dim,
-            activation_fn=self.activation_fn,
-            features_extractor=self.features_extractor,
-            diffusion_steps=self.schedule.n_steps,
-            noise_schedule=self.schedule.name,
-            sampler=self.sampler,
-            ddim_eta=self.ddim_eta,
-        )
-        return data
-
-    def features(self, observation: PyTorchObs) -> th.Tensor:
-        """
-        :param observation: Observations as SB3 gives them to policies
-        :return: What the denoiser is conditioned on, shape ``(batch, features_dim)``
-        """
-        return self.extract_features(observation, self.features_extractor)
-
-    def sample(
-        self,
-        features: th.Tensor,
-        noise: th.Tensor | None = None,
-        guidance: Guidance | None = None,
-        rule: GuidanceRule | None = None,
-        divergences: list[th.Tensor] | None = None,
-    ) -> th.Tensor:
-        """
-        Denoise actions, see :func:`sb3_causalgdp.diffusion.sample`.
-
-        :param features: Shape ``(batch, features_dim)``
-        :param noise: Shape ``(K, batch, d)``, drawn if None
-        :param guidance: Causal guidance, None for none
-        :param rule: How the guidance enters a step
-        :param divergences: If a list, each guided step appends its KL divergence
-        :return: Actions in [-1, 1], shape ``(batch, d)``
-        """
-        return sample(
-            self.denoiser,
-            self.schedule,
-            features,
-            guidance,
-            rule,
-            noise=noise,
-            sampler=self.sampler,
-            eta=self.ddim_eta,
-            divergences=divergences,
-        )
-
-    def adapt(self, features: th.Tensor, action: th.Tensor) -> th.Tensor:
-        """
-        Turn an action for one state into one for a state near by: the clean estimate at the diffusion step where little noise
-        is left, from the action as it is there without noise.
-
-        :param features: Of the state near by, shape ``(batch, features_dim)``
-        :param action: Shape ``(batch, d)``
-        :return: Actions in [-1, 1], shape ``(batch, d)``
-        """
-        step = th.full((len(action),), self.adapting_step, device=action.device)
-        noisy = self.schedule.add_noise(action, th.zeros_like(action), step)
-        return self.schedule.clean_estimate(noisy, bind(self.denoiser, features)(noisy, step), step).clamp(-1.0, 1.0)
-
-    def forward(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
-        features = self.features(observation)
-        shape = (self.schedule.n_steps, len(features), self.action_dim)
-        return self.sample(features, th.zeros(shape, device=features.device) if deterministic else None)
-
-    def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
-        return self(observation, deterministic)
-
-
-class CausalGDPPolicy(BasePolicy):
+class CausalGDPPolicy(SavedPolicy):
     """
     Policy of CausalGDP: diffusion actor, its moving average, critics, their targets and the masked world model.
 
@@ -411,7 +193,9 @@ class CausalGDPPolicy(BasePolicy):
             is_image_space(space, normalized_image=not self.normalize_images) for space in _leaf_spaces(self.observation_space)
         )
         self.world_model = MaskedWorldModel(self._state_dim(), self.actor.action_dim, self.world_model_net_arch)
-        self.register_buffer("candidate_noise", self._fixed_candidate_noise(), persistent=False)
+        # Of deterministic predictions
+        noise = fixed_noise(self.actor.schedule.n_steps, self.n_action_candidates, self.actor.action_dim)
+        self.register_buffer("candidate_noise", noise, persistent=False)
 
         optimizer_kwargs = self.optimizer_kwargs
         if self.optimizer_class in (th.optim.Adam, th.optim.AdamW) and "foreach" not in optimizer_kwargs:
@@ -437,29 +221,11 @@ class CausalGDPPolicy(BasePolicy):
                 f"got {len(self.guidance_rule.scales)} values"
             )
 
-    def _fixed_candidate_noise(self) -> th.Tensor:
-        """Noise of deterministic predictions: none for the first candidate, the same at every call for the others."""
-        generator = th.Generator().manual_seed(0)
-        shape = (self.actor.schedule.n_steps, self.n_action_candidates, self.actor.action_dim)
-        noise = th.randn(shape, generator=generator)
-        noise[:, 0] = 0.0
-        return noise
-
     def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> DiffusionActor:
         return DiffusionActor(**self._update_features_extractor(self.actor_kwargs, features_extractor)).to(self.device)
 
     def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> Critic:
         return Critic(**self._update_features_extractor(self.critic_kwargs, features_extractor)).to(self.device)
-
-    def first_not_finite(self, state_dict: Mapping[str, th.Tensor] | None = None) -> tuple[str, float] | None:
-        """
-        :param state_dict: Tensors by their names in this policy, None for its own
-        :return: Name and value of the first number that is NaN or infinite, None if there is none. Buffers of features
-            extractors may hold infinity, as masks of attention do
-        """
-        state_dict = self.state_dict() if state_dict is None else state_dict
-        buffers = [f"policy.{name}" for name, _ in self.named_buffers() if "features_extractor" in name]
-        return first_not_finite(state_dict, "policy", buffers)
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         data = super()._get_constructor_parameters()
@@ -479,53 +245,6 @@ class CausalGDPPolicy(BasePolicy):
             **self.guidance_kwargs,
         )
         return data
-
-    def save(self, path: str) -> None:
-        """
-        Save the policy alone; a file is replaced only once the new one is complete.
-
-        :param path: File, or file-like object
-        """
-        arguments = {**self._get_constructor_parameters(), "lr_schedule": None}
-        written, entries = plain_entries(arguments, _known_to_policies())
-        left = {name: value for name, value in arguments.items() if name not in written}
-        saved = {
-            "state_dict": self.state_dict(),
-            "data": left,
-            CONTENT: entries[CONTENT].decode(),
-            BLOCK: th.frombuffer(bytearray(entries[BLOCK] or b"0"), dtype=th.uint8),
-        }
-        # First in memory: on a full disk, PyTorch's error would be about a position
-        stream = io.BytesIO()
-        th.save(saved, stream)
-        with saved_when_done(path, "") as file:
-            if isinstance(file, pathlib.Path):
-                file.write_bytes(stream.getbuffer())
-            else:
-                file.write(stream.getbuffer())
-
-    @classmethod
-    def load(  # type: ignore[override]
-        cls: type[SelfPolicy], path: Any, device: th.device | str = "auto", *, trusted: bool = False
-    ) -> SelfPolicy:
-        """
-        Load a policy. Nothing that the file brings is run, unless it is trusted.
-
-        :param path: File, or file-like object
-        :param device: Device on which the policy should be
-        :param trusted: Whether the file may bring Python objects that could run code: it has to, where you gave the policy
-            classes of your own, or it was saved by a version that pickled all
-        :return: The policy
-        :raises ValueError: If the file is not whole, or not trusted and needs to be, or a tensor holds NaN or infinity
-        """
-        with errors_of(path, "cannot be loaded"), opened(path) as file:
-            state, arguments = _read_policy(file, get_device(device), trusted)
-            policy = cls(**arguments)
-            policy.load_state_dict(state)
-            found = policy.first_not_finite()
-            if found is not None:
-                raise ValueError(f"it is not a policy that can act: {found[0]} is {found[1]}")
-            return policy.to(get_device(device))
 
     @property
     def device(self) -> th.device:
@@ -691,92 +410,27 @@ class CausalGDPPolicy(BasePolicy):
         :raises ValueError: If an observation is NaN or infinite in float32, with its row and index
         :raises TrainingDivergedError: If the policy itself gives NaN, with the first of its tensors that holds it
         """
-        if isinstance(observation, np.ndarray):
-            if not fits_float32(observation):
-                self._refuse_observation(observation)
-        else:
-            self._check_parts(observation)
+        check_observation(observation, self.observation_space)
         actions, state = super().predict(observation, state, episode_start, deterministic)
         if not is_finite(actions):
-            self._say_what_diverged(actions)
+            found = self.first_not_finite()
+            raise TrainingDivergedError(*(found or ("the policy's action", float(actions[~np.isfinite(actions)][0]))))
         return actions, state
-
-    def _check_parts(self, observation: Any) -> None:
-        for key, values in observation.items() if isinstance(observation, dict) else ((None, observation),):
-            if isinstance(values, (list, np.ndarray)) and not fits_float32(np.asarray(values)):
-                self._refuse_observation(np.asarray(values), key)
-
-    def _refuse_observation(self, values: np.ndarray, key: str | None = None) -> None:
-        space = self.observation_space if key is None else self.observation_space[key]  # type: ignore[index]
-        index = first_not_finite_index(values)
-        value = np.atleast_1d(values)[index]
-        n_axes = len(space.shape or ())
-        row = f"row {index[0]}, " if values.ndim > n_axes else ""
-        name = "The observation" if key is None else f"observation[{key!r}]"
-        raise ValueError(f"{name} is {value} at {row}index {list(index[len(index) - n_axes :])}: it must be finite in float32")
-
-    def _say_what_diverged(self, actions: np.ndarray) -> None:
-        found = self.first_not_finite()
-        raise TrainingDivergedError(*(found or ("the policy's action", float(actions[~np.isfinite(actions)][0]))))
 
     def forward(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         return self._predict(observation, deterministic=deterministic)
 
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
-        action = self._act(observation, deterministic)
+        action = act(self, observation, deterministic)
         if not deterministic and self.exploration_noise > 0.0:
             action = (action + self.exploration_noise * th.randn_like(action)).clamp(-1.0, 1.0)
         return action
 
-    def _act(self, observation: PyTorchObs, deterministic: bool) -> th.Tensor:
-        acting = self._numpy_acting(observation)
-        if acting is not None:
-            assert isinstance(observation, th.Tensor)
-            noise = self._candidate_noise(len(observation), deterministic).cpu().numpy()
-            actions = acting(self, observation.float().flatten(1).cpu().numpy(), noise, self.is_guided)
-            return th.as_tensor(actions, device=observation.device)
-        with th.no_grad():
-            features = self.actor.features(observation)
-            return self._act_in_torch(observation, features, self._candidate_noise(len(features), deterministic))
+    # Files --------------------------------------------------------------------------------------------------------------
 
-    def _numpy_acting(self, observation: PyTorchObs) -> NumpyActing | None:
-        """The fast path for few rows, where it covers this policy; made anew when the networks were moved or replaced."""
-        if self.training or not isinstance(observation, th.Tensor):
-            return None
-        if len(observation) * self.n_action_candidates > NumpyActing.MOST_ROWS:
-            return None
-        if self._acting is not None and not self._acting.is_current(self):
-            self._acting = None
-        if self._acting is None and NumpyActing.covers(self):
-            self._acting = NumpyActing(self)
-        return self._acting
-
-    def _act_in_torch(self, observation: PyTorchObs, features: th.Tensor, noise: th.Tensor) -> th.Tensor:
-        critic_features = self.critic_target.extract_features(observation, self.critic_target.features_extractor)
-        candidates = self.actor.sample(features.repeat_interleave(self.n_action_candidates, dim=0), noise)
-        best = self._best_candidate(critic_features, candidates)
-        action = candidates[best]
-        if not self.is_guided:
-            return action
-        # From the same noise, the guided chain ends at the best candidate, moved by the guidance
-        guidance = self.acting_guidance(self.causal_state(observation), action)
-        return self.actor.sample(features, noise[:, best], guidance, self.guidance_rule)
-
-    def _candidate_noise(self, n_observations: int, deterministic: bool) -> th.Tensor:
-        if deterministic:
-            return self.candidate_noise if n_observations == 1 else self.candidate_noise.repeat(1, n_observations, 1)
-        n_steps, n_candidates, action_dim = self.candidate_noise.shape
-        return th.randn(n_steps, n_observations * n_candidates, action_dim, device=self.candidate_noise.device)
-
-    def _best_candidate(self, critic_features: th.Tensor, actions: th.Tensor) -> th.Tensor:
-        """Row of the candidate with the largest of the smallest target Q, for each observation."""
-        first = th.arange(0, len(actions), self.n_action_candidates, device=actions.device)
-        if self.n_action_candidates == 1:
-            return first
-        n_candidates = self.n_action_candidates
-        repeated = critic_features.repeat_interleave(n_candidates, dim=0)
-        values = th.cat(q_values(self.critic_target, repeated, actions), dim=1).amin(dim=1)
-        return first + values.view(-1, n_candidates).argmax(dim=1)
+    @classmethod
+    def known_classes(cls) -> Known:
+        return KNOWN + Known([], [CausalGDPPolicy, CnnPolicy, MultiInputPolicy])
 
 
 def _leaf_spaces(space: spaces.Space) -> list[spaces.Space]:
@@ -843,31 +497,3 @@ class MultiInputPolicy(CausalGDPPolicy):
 
 
 MlpPolicy = CausalGDPPolicy
-
-
-def _known_to_policies() -> Known:
-    """
-    :return: What a saved policy may name
-    """
-    return KNOWN + Known([], [CausalGDPPolicy, CnnPolicy, MultiInputPolicy])
-
-
-def _read_policy(file: BinaryIO, device: th.device, trusted: bool) -> tuple[dict[str, th.Tensor], dict[str, Any]]:
-    """Parameters, and the arguments of the constructor."""
-    if trusted:
-        saved = th.load(file, map_location=device, weights_only=False)
-    else:
-        check_tensor_file(file, "it")
-        try:
-            saved = th.load(file, map_location=device, weights_only=True)
-        except pickle.UnpicklingError as error:
-            raise ValueError(f"it holds pickled objects, which could run code: {TRUST}") from error
-    content = saved.get(CONTENT)
-    arguments = (
-        {} if content is None else decoded(read_json(content), saved[BLOCK].cpu().numpy().tobytes(), _known_to_policies())
-    )
-    arguments = {**saved["data"], **arguments}
-    if not trusted:
-        check_limits(arguments, size_of(file))
-    # Schedules are not needed for predictions
-    return saved["state_dict"], {**arguments, "lr_schedule": BasePolicy._dummy_schedule}

@@ -15,6 +15,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import NormalActionNoise
 
 from sb3_causalgdp import CausalGDP, MlpPolicy, TrainingDivergedError
+from sb3_causalgdp.divergence import check_losses
 from sb3_causalgdp.offline.replay import SpacesEnv
 
 
@@ -96,11 +97,10 @@ def test_the_first_loss_and_its_update_are_named(module, quantity, update):
 
 
 def test_losses_that_are_finite_raise_nothing_however_large():
-    model = make()
-    model._n_updates = 2
-    model._check_losses([("critic_loss", 1e38), ("critic_loss", 3e38)])
+    steps = {"last_step": 2, "delays": {"critic_loss": 1}, "delay": 2}
+    check_losses([("critic_loss", 1e38), ("critic_loss", 3e38)], **steps)
     with pytest.raises(TrainingDivergedError, match="actor_loss is inf at update 2"):
-        model._check_losses([("critic_loss", 1.0), ("critic_loss", 1.0), ("actor_loss", math.inf)])
+        check_losses([("critic_loss", 1.0), ("critic_loss", 1.0), ("actor_loss", math.inf)], **steps)
 
 
 def test_a_policy_that_diverged_acts_no_more_and_the_environment_is_not_blamed():

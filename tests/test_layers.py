@@ -12,13 +12,15 @@ LAYERS = [
     {"callbacks.pictures"},
     {"__init__"},
     {"causalgdp"},
-    {"callbacks", "checkpoints"},
-    {"callbacks.world_model"},
-    {"losses", "callbacks.diagnostics", "structural", "acceleration.device_replay", "acceleration.cuda_graphs"},
-    {"acceleration.gradients"},
-    {"acceleration.product_pass"},
-    {"policies"},
-    {"acceleration.acting", "arguments", "saving.models"},
+    {"saving.algorithm"},
+    {"callbacks", "checkpoints", "knowledge"},
+    {"callbacks.world_model", "updates"},
+    {"losses", "batches", "callbacks.diagnostics", "questions", "acceleration.fast_steps"},
+    {"policies", "acceleration.device_replay", "acceleration.cuda_graphs", "acceleration.gradients"},
+    {"prediction", "acceleration.product_pass"},
+    {"networks", "acceleration.acting"},
+    {"saving.policies", "acceleration.numpy_networks"},
+    {"arguments", "saving.models"},
     {"causal.__main__"},
     {"causal", "offline", "diffusion"},
     {"causal.plots", "causal.sources", "causal.guidance"},
@@ -30,7 +32,7 @@ LAYERS = [
     {"causal.drawing", "causal.variables"},
     {"causal.edges", "sources", "lazy"},
     {"checks", "divergence", "files", "acceleration.products", "acceleration.activations", "saving.plain", "saving.archives"},
-    {"saving.numpy_pickles", "acceleration", "saving", "moved"},
+    {"saving.numpy_pickles", "acceleration.switch", "acceleration", "saving", "moved"},
 ]
 # Graphs and answers are drawn by pictures that know them: this file imports those late, and no other does
 LATE = {("causal.drawing", "causal.plots")}
@@ -46,6 +48,9 @@ WITHOUT_SB3 = {
     "acceleration.product_pass",
     "acceleration.activations",
     "acceleration.cuda_graphs",
+    "acceleration.fast_steps",
+    "acceleration.numpy_networks",
+    "acceleration.switch",
 }
 LEVELS = {part: level for level, parts in enumerate(LAYERS) for part in parts}
 FILES = sorted(PACKAGE.rglob("*.py"))

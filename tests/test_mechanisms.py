@@ -7,7 +7,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 
 from sb3_causalgdp import CausalGDP, CausalWorldModelCallback
-from sb3_causalgdp.causalgdp import StepPlan
+from sb3_causalgdp.updates import StepPlan
 
 KWARGS = {
     "learning_starts": 50,
@@ -107,9 +107,9 @@ def test_guidance_enters_the_actors_loss(trained, monkeypatch):
     def denoising():
         th.manual_seed(0)
         with th.random.fork_rng(), monkeypatch.context() as patch:
-            patch.setattr(model, "_step", lambda module, gradients: None)
+            patch.setattr(model._updates, "step", lambda module, gradients: None)
             plan = StepPlan(True, True, model.policy.is_guided, climbed=0, running_weight=0.01)
-            return float(model._update_actor(data, data.actions, plan)["denoising_loss"])
+            return float(model._updates.update_actor(data, data.actions, plan)["denoising_loss"])
 
     guided = denoising()
     assert denoising() == guided
@@ -195,7 +195,7 @@ def test_the_world_model_trains_on_masks_that_are_drawn_unless_they_shall_scale(
     data = model.replay_buffer.sample(16)
     batch = (data.observations, data.actions, data.next_observations, data.rewards.flatten(), None)
     monkeypatch.setattr(world, "update_statistics", lambda *args: None)  # which would change the loss, too
-    losses = {model._world_model_gradients(*batch)[0].item() for _ in range(5)}
+    losses = {model._updates.world_model_gradients(*batch)[0].item() for _ in range(5)}
     assert len(losses) == (5 if sample_masks else 1)
 
 
@@ -271,7 +271,7 @@ def next_actions_of(actor, data):
 def test_td_target_is_the_smallest_target_critic_at_the_moving_averages_action(disagreeing):
     model, data = disagreeing
     th.manual_seed(7)
-    next_actions, target = model._td_target(data)
+    next_actions, target = model._updates.td_target(data)
     assert th.equal(next_actions, next_actions_of(model.actor_target, data))
     assert not th.allclose(next_actions, next_actions_of(model.actor, data))
 
@@ -291,9 +291,9 @@ def test_td_target_is_the_smallest_target_critic_at_the_moving_averages_action(d
 def test_backup_over_several_actions_takes_the_best_of_them(disagreeing):
     model, data = disagreeing
     model.max_q_backup = True
-    n_actions = model.N_BACKUP_ACTIONS
+    n_actions = model._updates.N_BACKUP_ACTIONS
     th.manual_seed(7)
-    _, target = model._td_target(data)
+    _, target = model._updates.td_target(data)
     repeated = data.next_observations.repeat_interleave(n_actions, dim=0)
     th.manual_seed(7)
     actions = model.actor_target.sample(model.actor_target.features(repeated))
@@ -306,7 +306,7 @@ def test_targets_follow_slowly(trained):
     model, _ = trained
     for online, target in ((model.actor, model.actor_target), (model.critic, model.critic_target)):
         before = [parameter.clone() for parameter in target.parameters()]
-        model._update_targets()
+        model._updates.update_averages()
         for old, new, goal in zip(before, target.parameters(), online.parameters(), strict=True):
             th.testing.assert_close(new, (1.0 - model.tau) * old + model.tau * goal)
         assert any(not th.equal(old, goal) for old, goal in zip(before, online.parameters(), strict=True))
@@ -327,6 +327,6 @@ def test_a_gradient_step_trains_actor_critics_and_world_model_and_the_actors_los
         }
 
     plan = StepPlan(True, True, model.policy.is_guided, climbed=0, running_weight=0.01)
-    assert changed_by(lambda: model._update_actor(data, data.actions, plan)) == {"actor"}
-    assert changed_by(lambda: model._update_critics(data, data.rewards, 0.01)) == {"critic"}
-    assert changed_by(lambda: model._update_world_model(data, 0.01)) == {"world_model"}
+    assert changed_by(lambda: model._updates.update_actor(data, data.actions, plan)) == {"actor"}
+    assert changed_by(lambda: model._updates.update_critics(data, data.rewards, 0.01)) == {"critic"}
+    assert changed_by(lambda: model._updates.update_world_model(data, 0.01)) == {"world_model"}

@@ -338,7 +338,7 @@ def test_only_a_policy_that_was_not_pretrained_starts_with_random_actions(pretra
 def n_offline(model, batch_size=1000):
     """How many rows of a batch were preloaded, by their marked rewards."""
     model.offline_buffer.rewards[:] = 99.0
-    return int((model._sample(batch_size).rewards == 99.0).sum())
+    return int((model._updates.batches.sample(batch_size).rewards == 99.0).sum())
 
 
 @pytest.mark.parametrize(("fraction", "expected"), [(0.5, 500), (0.0, 0), (0.25, 250), (1.0, 1000)])

@@ -11,6 +11,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise, VectorizedActionNoise
 
 from sb3_causalgdp import CausalGDP, CausalWorldModelCallback, MlpPolicy
+from sb3_causalgdp.updates import Updates
 
 
 class CountingEnv(gym.Env):
@@ -248,24 +249,28 @@ def test_the_optimizer_is_the_one_asked_for(optimizer_class, optimizer_kwargs):
 # Several steps, and a buffer that saves memory --------------------------------------------------------------------------
 
 
-class SpyingGDP(CausalGDP):
-    """Keeps the transitions that each part learned from."""
+class SpyingUpdates(Updates):
+    """Keeps the transitions that each part learned from, and the actions after the actor's."""
 
-    def __init__(self, *args, **kwargs):
+    def __init__(self, model):
         self.seen = {"critics": [], "world model": [], "actor": []}
-        super().__init__(*args, **kwargs)
+        super().__init__(model)
 
-    def _update_critics(self, replay_data, *args):
+    def update_critics(self, replay_data, *args):
         self.seen["critics"].append(replay_data)
-        return super()._update_critics(replay_data, *args)
+        return super().update_critics(replay_data, *args)
 
-    def _update_world_model(self, transitions, *args):
+    def update_world_model(self, transitions, *args):
         self.seen["world model"].append(transitions)
-        return super()._update_world_model(transitions, *args)
+        return super().update_world_model(transitions, *args)
 
-    def _update_actor(self, transitions, next_actions, guided):
+    def actor_gradients(self, transitions, next_actions, *args):
         self.seen["actor"].append((transitions, next_actions))
-        return super()._update_actor(transitions, next_actions, guided)
+        return super().actor_gradients(transitions, next_actions, *args)
+
+
+class SpyingGDP(CausalGDP):
+    updates_class = SpyingUpdates
 
 
 N_STEP_BUFFERS = [
@@ -286,8 +291,8 @@ def test_with_n_step_returns_the_world_model_learns_from_single_steps(kwargs, n_
         return th.cat([getattr(batch, name) for batch in batches])
 
     for part, batches in (
-        ("world model", model.seen["world model"]),
-        ("actor", [transitions for transitions, _ in model.seen["actor"]]),
+        ("world model", model._updates.seen["world model"]),
+        ("actor", [transitions for transitions, _ in model._updates.seen["actor"]]),
     ):
         states, next_states = column(batches, "observations"), column(batches, "next_observations")
         assert th.equal(next_states[:, 0], states[:, 0] + 1.0), part
@@ -298,13 +303,16 @@ def test_with_n_step_returns_the_world_model_learns_from_single_steps(kwargs, n_
         assert th.equal(column(batches, "dones")[:, 0], ended.float()), part
 
     # The critics' next states lie up to three steps ahead, and their rewards are sums
-    states, next_states = column(model.seen["critics"], "observations"), column(model.seen["critics"], "next_observations")
+    states, next_states = (
+        column(model._updates.seen["critics"], "observations"),
+        column(model._updates.seen["critics"], "next_observations"),
+    )
     ahead = (next_states[:, 0] - states[:, 0]).int()
     assert set(ahead.tolist()) == {1, 2, 3}
     steps = th.arange(3)
     weights = 0.99**steps * (steps < ahead.unsqueeze(1))
     returns = (weights * (states[:, :1] + steps)).sum(dim=1)
-    th.testing.assert_close(column(model.seen["critics"], "rewards")[:, 0], returns)
+    th.testing.assert_close(column(model._updates.seen["critics"], "rewards")[:, 0], returns)
 
 
 def test_with_n_step_returns_the_guidance_asks_for_the_next_step(monkeypatch):
@@ -317,7 +325,7 @@ def test_with_n_step_returns_the_guidance_asks_for_the_next_step(monkeypatch):
     monkeypatch.setattr(model.actor_target, "sample", lambda features: features / 1000.0)
     model.train(gradient_steps=4, batch_size=8)
     for (state, next_state, next_action, critic), (transitions, next_actions) in zip(
-        asked, model.seen["actor"][-4:], strict=True
+        asked, model._updates.seen["actor"][-4:], strict=True
     ):
         assert critic in (0, 1)
         assert th.equal(state, transitions.observations)
@@ -342,7 +350,7 @@ def test_the_memory_efficient_buffer_gives_the_guidance_a_predicted_end_of_each_
     make_guidance = model.policy.make_guidance
     monkeypatch.setattr(model.policy, "make_guidance", lambda *args: asked.append(args) or make_guidance(*args))
     data = model.replay_buffer.sample(200)
-    model._actor_losses(data, data.actions, 0, True)
+    model._updates.actor_losses(data, data.actions, 0, True)
     ((state, next_state, _, _),) = asked
     ended = data.dones.flatten() > 0.0
     assert 0 < ended.sum() < 200

@@ -10,6 +10,7 @@ from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 
 from sb3_causalgdp import CausalGDP
+from sb3_causalgdp.batches import Batches
 from sb3_causalgdp.diffusion.bounds import bounded
 from sb3_causalgdp.losses import denoising_loss
 from sb3_causalgdp.offline.replay import deal_rows, rows_of
@@ -78,7 +79,7 @@ def test_actor_and_world_model_are_updated_once_every_so_many_gradient_steps(pol
 @pytest.mark.parametrize("steps_per_call", [1, 2, 5])
 def test_target_networks_follow_at_every_gradient_step(steps_per_call, monkeypatch):
     model = trained_model(policy_delay=3)
-    monkeypatch.setattr(model, "_step", lambda module, gradients: None)
+    monkeypatch.setattr(model._updates, "step", lambda module, gradients: None)
     online, before = (
         th.nn.utils.parameters_to_vector([*actor.parameters(), *critic.parameters()]).clone()
         for actor, critic in ((model.actor, model.critic), (model.actor_target, model.critic_target))
@@ -94,7 +95,7 @@ def test_target_networks_follow_at_every_gradient_step(steps_per_call, monkeypat
 def test_td_targets_up_to_an_update_of_the_actor_are_computed_at_once(n_updates, sizes, monkeypatch):
     model = trained_model(policy_delay=2)
     model._n_updates = n_updates
-    asked, given, td_target, update_critics = [], [], model._td_target, model._update_critics
+    asked, given, td_target, update_critics = [], [], model._updates.td_target, model._updates.update_critics
 
     def ask(data):
         asked.append((data, td_target(data)[1]))
@@ -104,8 +105,8 @@ def test_td_targets_up_to_an_update_of_the_actor_are_computed_at_once(n_updates,
         given.append((data, target.clone()))
         return update_critics(data, target, *args)
 
-    monkeypatch.setattr(model, "_td_target", ask)
-    monkeypatch.setattr(model, "_update_critics", give)
+    monkeypatch.setattr(model._updates, "td_target", ask)
+    monkeypatch.setattr(model._updates, "update_critics", give)
     model.train(gradient_steps=5, batch_size=32)
     assert [len(target) for _, target in asked] == [32 * size for size in sizes]
     assert th.equal(th.cat([data.rewards for data, _ in asked]), th.cat([data.rewards for data, _ in given]))
@@ -127,7 +128,7 @@ def q_term_and_its_noise(model, data):
     """The Q term, and the action that the denoising term's own noise prediction gives."""
     actor, actions = model.actor, data.actions
     th.manual_seed(5)
-    _, q_term = model._actor_losses(data, actions, climbed=0, guided=False)
+    _, q_term = model._updates.actor_losses(data, actions, climbed=0, guided=False)
     th.manual_seed(5)
     step = th.randint(actor.schedule.n_steps, (len(actions),))
     noise = th.randn_like(actions)
@@ -158,7 +159,7 @@ def test_the_next_critic_sets_the_scale_and_a_single_one_its_own(n_critics, clim
                 size = size - q_values(model.critic, data.observations.float(), data.actions)[scale].detach()
             losses.append(-values[climbed].mean() / size.abs().mean())
         else:
-            losses.append(model._actor_losses(data, data.actions, climbed, False)[1])
+            losses.append(model._updates.actor_losses(data, data.actions, climbed, False)[1])
     th.testing.assert_close(*losses)
     ours, theirs = (th.autograd.grad(loss, list(model.actor.parameters())) for loss in losses)
     th.testing.assert_close(ours, theirs, rtol=1e-4, atol=1e-6)
@@ -217,7 +218,7 @@ def test_many_gradient_steps_sample_the_buffer_once(monkeypatch):
     monkeypatch.setattr(model.replay_buffer, "sample", lambda size, env=None: sizes.append(size) or original(size, env))
     model.train(gradient_steps=5, batch_size=32)
     assert sizes == [160]
-    monkeypatch.setattr(CausalGDP, "MOST_ROWS_PER_DRAW", 64)
+    monkeypatch.setattr(Batches, "MOST_ROWS_PER_DRAW", 64)
     model.train(gradient_steps=5, batch_size=32)
     assert sizes[1:] == [64, 64, 32]
 
@@ -225,9 +226,9 @@ def test_many_gradient_steps_sample_the_buffer_once(monkeypatch):
 def test_every_gradient_step_of_a_draw_has_its_own_rows(monkeypatch):
     model = trained_model()
     seen = []
-    original = model._update_critics
+    original = model._updates.update_critics
     monkeypatch.setattr(
-        model, "_update_critics", lambda data, *args: seen.append(data.actions.clone()) or original(data, *args)
+        model._updates, "update_critics", lambda data, *args: seen.append(data.actions.clone()) or original(data, *args)
     )
     model.train(gradient_steps=4, batch_size=32)
     assert [len(actions) for actions in seen] == [32] * 4
@@ -237,8 +238,8 @@ def test_every_gradient_step_of_a_draw_has_its_own_rows(monkeypatch):
 def test_logs_are_means_over_the_gradient_steps(monkeypatch):
     model = trained_model(policy_delay=1)
     values = iter([1.0, 2.0, 6.0])
-    original = model._update_actor
-    monkeypatch.setattr(model, "_update_actor", lambda *args: {**original(*args), "q_loss": th.tensor(next(values))})
+    original = model._updates.update_actor
+    monkeypatch.setattr(model._updates, "update_actor", lambda *args: {**original(*args), "q_loss": th.tensor(next(values))})
     model.set_logger(Logger(None, []))
     model.train(gradient_steps=3, batch_size=16)
     assert model.logger.name_to_value["train/q_loss"] == pytest.approx(3.0)
@@ -344,8 +345,8 @@ def test_what_a_compiler_made_trains_as_the_plain_code_and_is_saved_as_a_wish(tm
 def test_updates_run_with_the_threads_asked_for_and_give_them_back(torch_threads, expected, monkeypatch):
     model = trained_model(torch_threads=torch_threads)
     seen = []
-    original = model._update_targets
-    monkeypatch.setattr(model, "_update_targets", lambda: seen.append(th.get_num_threads()) or original())
+    original = model._updates.update_averages
+    monkeypatch.setattr(model._updates, "update_averages", lambda: seen.append(th.get_num_threads()) or original())
     before = th.get_num_threads()
     try:
         th.set_num_threads(3)

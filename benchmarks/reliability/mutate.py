@@ -3,13 +3,14 @@ Damage files with fixed seeds, read them in processes of their own, and count wh
 
     python benchmarks/reliability/mutate.py --mutations 3000
 
-Model zips, policies, replay buffers, datasets of arrays and of HDF5, and graphs are changed: bits flipped, the file cut,
-entries of archives swapped, numbers and texts in JSON replaced by wild ones with sound checksums. What is then read has to be
-used without harm, or refused by one line that names the file. Counted are crashes of the process, hangs, errors of another
-kind, and NaN that nobody mentions.
+Model zips, checkpoints, policies, replay buffers, datasets of arrays and of HDF5, and graphs are changed: bits flipped, the
+file cut, entries of archives swapped, numbers and texts in JSON replaced by wild ones with sound checksums. What is then read
+has to be used without harm, or refused by one line that names the file. Counted are crashes of the process, hangs, errors of
+another kind, and NaN that nobody mentions.
 """
 
 import argparse
+import hashlib
 import io
 import json
 import multiprocessing
@@ -28,7 +29,10 @@ from pathlib import Path
 from typing import Any
 
 SECONDS = 30.0
-KINDS = ("model.zip", "policy.pt", "buffer.npz", "buffer.pkl", "her.npz", "arrays.npz", "minari", "graph.json")
+KINDS = (
+    *("model.zip", "parameters.zip", "checkpoint.zip", "policy.pt", "buffer.npz", "buffer.pkl", "her.npz", "arrays.npz"),
+    *("minari", "graph.json"),
+)
 WILD: tuple[Any, ...] = (
     *(None, True, False, [], {}, "", "x", "nan", "../../etc/passwd", "os:system", -1, 0, 1, 2, 3.5, 1e9, -1e9, 1e308),
     *(10**6, 10**9, 10**18, -(10**18), 10**400, float("nan"), float("inf"), "a" * 10_000, [[]] * 50, {"class": "os.system"}),
@@ -55,6 +59,8 @@ def write_files(folder: Path) -> None:
     th.set_num_threads(1)
     model = _model().learn(260)
     model.save(folder / "model.zip", include=["causal_graph_history"])
+    shutil.copyfile(folder / "model.zip", folder / "parameters.zip")
+    model.save_checkpoint(folder / "checkpoint.zip")
     model.policy.save(str(folder / "policy.pt"))
     model.save_replay_buffer(folder / "buffer.npz")
     model.save_replay_buffer(folder / "buffer.pkl")
@@ -169,6 +175,26 @@ def _with_wild_json(data: bytes, generator: random.Random) -> bytes:
     return re.sub(rb"\((\d+),\)", lambda found: b"(%d,)" % len(text), data[:start]) + text
 
 
+def _signed(data: bytes) -> bytes:
+    """A checkpoint with the sums that its files have now, as somebody who wants to harm would write it."""
+    from sb3_causalgdp.checkpoints.store import _checksum
+
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            entries = {name: archive.read(name) for name in archive.namelist()}
+        manifest = json.loads(entries["manifest.json"])
+        sums = {name: hashlib.sha256(entries[name]).hexdigest() for name in manifest["files"] if name in entries}
+        manifest["files"] |= sums
+        entries["manifest.json"] = json.dumps({**manifest, "checksum": _checksum(manifest)}).encode()
+    except Exception:
+        return data
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w") as archive:
+        for one, content in entries.items():
+            archive.writestr(one, content)
+    return stream.getvalue()
+
+
 def _places(content: Any) -> Any:
     for key, value in content.items() if isinstance(content, dict) else enumerate(content):
         yield content, key
@@ -197,6 +223,14 @@ def read(path: Path, kind: str) -> Any:
     if kind == "model.zip":
         model = CausalGDP.load(path, device="cpu")
         return [model.predict(observations, deterministic=True)[0], model.causal_graph().effects]
+    if kind == "parameters.zip":
+        model = _model()
+        model.set_parameters(path, device="cpu")
+        return [model.predict(observations, deterministic=True)[0]]
+    if kind == "checkpoint.zip":
+        model = CausalGDP.resume(path, "Pendulum-v1", device="cpu")
+        model.learn(2, reset_num_timesteps=False)
+        return [model.predict(observations, deterministic=True)[0], model.replay_buffer.rewards]
     if kind == "policy.pt":
         return [MlpPolicy.load(path, device="cpu").predict(observations, deterministic=True)[0]]
     if kind == "graph.json":
@@ -252,7 +286,8 @@ def _damage(files: Path, target: Path, kind: str, seed: int) -> Path:
     generator = random.Random(f"{kind} {seed}")
     path = target / kind
     if kind != "minari":
-        path.write_bytes(mutated((files / kind).read_bytes(), generator))
+        damaged = mutated((files / kind).read_bytes(), generator)
+        path.write_bytes(_signed(damaged) if kind == "checkpoint.zip" else damaged)
         return path
     shutil.rmtree(path, ignore_errors=True)
     shutil.copytree(files / kind, path)

@@ -3,11 +3,16 @@ Whether memory stays flat in a long training that does everything all the time.
 
     python benchmarks/reliability/soak.py --steps 200000
 
-Eight environments of Pendulum, a causal graph every 50 steps, pictures, evaluations, saves and checkpoints. Prints the
-memory of the process over the training, and how much the second half differs from its own mean.
+Eight environments of Pendulum, a causal graph every 50 steps, pictures, evaluations, saves and checkpoints. Prints two
+kinds of memory over the training: what the process has ("resident"), and what of it the program has asked the C library for
+and not given back ("in use"). The first also holds what the C library keeps for later, which moves up and down by some
+percent; a leak makes both grow. The trend is the mean of the last third against that of the one before; the first third fills
+the buffer.
 """
 
 import argparse
+import ctypes
+import gc
 import tempfile
 from pathlib import Path
 
@@ -26,19 +31,51 @@ def resident_megabytes() -> float:
     return pages * 4096 / 1e6
 
 
+class _MallInfo2(ctypes.Structure):
+    """What glibc says of its heap, ``mallinfo2(3)``."""
+
+    _fields_ = [
+        (name, ctypes.c_size_t)
+        for name in ("arena", "ordblks", "smblks", "hblks", "hblkhd", "usmblks", "fsmblks", "uordblks", "fordblks", "keepcost")
+    ]
+
+
+def megabytes_in_use() -> float:
+    """Of this process's heap, of all its threads; glibc 2.33 or newer."""
+    mallinfo2 = ctypes.CDLL(None).mallinfo2
+    mallinfo2.restype = _MallInfo2
+    info = mallinfo2()
+    return (info.uordblks + info.hblkhd) / 1e6
+
+
 class Memory(BaseCallback):
-    """Keeps how much memory the process has."""
+    """Keeps how much memory the process has, and how much of it is in use."""
 
     def __init__(self, every: int) -> None:
         super().__init__()
         self.every = every
-        self.megabytes: list[float] = []
+        self.megabytes: dict[str, list[float]] = {"resident": [], "in use": []}
 
     def _on_step(self) -> bool:
         if self.num_timesteps % self.every == 0:
-            self.megabytes.append(resident_megabytes())
-            print(f"{self.num_timesteps:,} steps: {self.megabytes[-1]:.0f} MB", flush=True)
+            gc.collect()  # or it would be counted whether the collector has just been here
+            self.megabytes["resident"].append(resident_megabytes())
+            self.megabytes["in use"].append(megabytes_in_use())
+            now = ", ".join(f"{name} {values[-1]:.1f} MB" for name, values in self.megabytes.items())
+            print(f"{self.num_timesteps:,} steps: {now}", flush=True)
         return True
+
+
+def trend(megabytes: list[float]) -> str:
+    """The last third against the one before, and how far single values are from the mean of both."""
+    third = len(megabytes) // 3
+    before, last = np.array(megabytes[-2 * third : -third]), np.array(megabytes[-third:])
+    mean = (before.mean() + last.mean()) / 2
+    single = np.concatenate((before, last)) / mean - 1
+    return (
+        f"{before.mean():.1f} MB, then {last.mean():.1f} MB ({last.mean() / before.mean() - 1:+.2%}); "
+        f"single values {single.min():+.1%} to {single.max():+.1%}"
+    )
 
 
 def main() -> None:
@@ -62,8 +99,8 @@ def main() -> None:
             memory,
         ]
         model.learn(arguments.steps, callbacks)
-    half = np.array(memory.megabytes[len(memory.megabytes) // 2 :])
-    print(f"second half: {half.mean():.0f} MB, {half.min() / half.mean() - 1:+.1%} to {half.max() / half.mean() - 1:+.1%}")
+    for name, values in memory.megabytes.items():
+        print(f"{name}: {trend(values)}")
 
 
 if __name__ == "__main__":

@@ -82,7 +82,7 @@ def states_of(model: CausalGDP) -> list[th.Tensor]:
     :param model: After its first update
     :return: All that an update writes: parameters, running averages and states of optimizers
     """
-    states = [state for optimizer in model._optimizers() for state in optimizer.state.values()]
+    states = [state for optimizer in model._updates.optimizers() for state in optimizer.state.values()]
     return [*model.policy.state_dict().values(), *(value for state in states for value in state.values())]
 
 

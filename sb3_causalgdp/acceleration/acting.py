@@ -8,10 +8,7 @@ covered is left to the plain path, see :meth:`NumpyActing.covers`.
 """
 
 import copy
-from collections.abc import Callable, Iterable, Sequence
-from functools import reduce
-from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch as th
@@ -20,437 +17,21 @@ from stable_baselines3.common.torch_layers import FlattenExtractor
 from threadpoolctl import ThreadpoolController
 from torch import nn
 
-from sb3_causalgdp.acceleration.activations import fast
-from sb3_causalgdp.causal.world_model import MaskedBlocks, MaskedWorldModel
-from sb3_causalgdp.diffusion import GuidanceRule, MLPDenoiser, NoiseSchedule
-from sb3_causalgdp.diffusion.samplers import transition_weights
+from sb3_causalgdp.acceleration import switch
+from sb3_causalgdp.acceleration.numpy_networks import (
+    ACTIVATIONS,
+    ONE,
+    Critics,
+    Denoiser,
+    Rule,
+    WorldModel,
+    has_plain_layers,
+    view,
+    without_norms,
+)
+from sb3_causalgdp.diffusion import MLPDenoiser
 
 Policy = Any  # a CausalGDPPolicy, whose file imports this one
-
-
-def _constant(value: float) -> np.ndarray:
-    # A product of a few numbers with an array of no dimension takes half the time of one with a Python number
-    return np.array(value, dtype=np.float32)
-
-
-_ZERO, _ONE, _MINUS_ONE, _TWO = _constant(0.0), _constant(1.0), _constant(-1.0), _constant(2.0)
-_LARGEST_EXPONENT = _constant(20.0)
-_ROUNDING = _constant(8.0 * float(np.finfo(np.float32).eps))
-_SMALLEST_RESIDUAL_STD, _MOST_CHANGE = _constant(1e-4), _constant(4.0)  # those of MaskedWorldModel
-
-
-class Activation(NamedTuple):
-    """An activation and its derivative, the latter from the input and the output."""
-
-    value: Callable[[np.ndarray], np.ndarray]
-    derivative: Callable[[np.ndarray, np.ndarray], np.ndarray]
-
-
-def _sigmoid(x: np.ndarray) -> np.ndarray:
-    # By tanh, which does not overflow
-    return 0.5 * (1.0 + np.tanh(0.5 * x))
-
-
-def _tanh_of_softplus(x: np.ndarray) -> np.ndarray:
-    # tanh(log(1 + e)) = ((1 + e)^2 - 1) / ((1 + e)^2 + 1): one exponential; beyond 20 it is 1 in float32
-    exponential = np.minimum(x, _LARGEST_EXPONENT)
-    np.exp(exponential, out=exponential)
-    result = exponential + _TWO
-    result *= exponential
-    result /= result + _TWO
-    return result
-
-
-def _mish_derivative(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    squashed = _tanh_of_softplus(x)
-    return squashed + x * _sigmoid(x) * (1.0 - squashed * squashed)
-
-
-def _silu_derivative(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    gate = _sigmoid(x)
-    return gate + y * (1.0 - gate)
-
-
-ACTIVATIONS: dict[type[nn.Module], Activation] = {
-    nn.ReLU: Activation(lambda x: np.maximum(x, _ZERO), lambda x, y: y > _ZERO),
-    nn.Tanh: Activation(np.tanh, lambda x, y: _ONE - y * y),
-    nn.Mish: Activation(lambda x: x * _tanh_of_softplus(x), _mish_derivative),
-    nn.SiLU: Activation(lambda x: x * _sigmoid(x), _silu_derivative),
-}
-
-
-def _clip(values: np.ndarray, lowest: np.ndarray = _MINUS_ONE, highest: np.ndarray = _ONE) -> np.ndarray:
-    # Half of the time of ndarray.clip
-    raised = np.maximum(values, lowest)
-    return np.minimum(raised, highest, out=raised)
-
-
-Layer = tuple[np.ndarray, np.ndarray]
-"""A weight, shape ``(outputs, inputs)``, and a bias, shape ``(outputs, 1)``."""
-
-
-def _view(tensor: th.Tensor) -> np.ndarray:
-    return tensor.detach().numpy()
-
-
-def _layer(linear: nn.Linear) -> Layer:
-    return _view(linear.weight), _view(linear.bias)[:, None]
-
-
-def _linear_layers(modules: Iterable[nn.Module]) -> list[Layer]:
-    return [_layer(module) for module in modules if isinstance(module, nn.Linear)]
-
-
-def _has_plain_layers(modules: Iterable[nn.Module], activation: type[nn.Module]) -> bool:
-    """Whether there is nothing but layers with a bias and that activation."""
-    return all(
-        (isinstance(module, nn.Linear) and module.bias is not None) or type(module) in (activation, fast(activation))
-        for module in modules
-    )
-
-
-class _LayerNorm:
-    """``nn.LayerNorm`` of columns."""
-
-    def __init__(self, module: nn.LayerNorm) -> None:
-        self.weight, self.bias = _view(module.weight)[:, None], _view(module.bias)[:, None]
-        self.epsilon = np.float32(module.eps)
-
-    def __call__(self, values: np.ndarray) -> np.ndarray:
-        standardised, _ = self._standardise(values)
-        return self.weight * standardised + self.bias
-
-    def backward(self, gradient: np.ndarray, values: np.ndarray) -> np.ndarray:
-        """From the gradient by what came out, the one by the values that went in."""
-        standardised, inverse_std = self._standardise(values)
-        gradient = self.weight * gradient
-        along = (gradient * standardised).mean(axis=0)
-        return inverse_std * (gradient - gradient.mean(axis=0) - along * standardised)
-
-    def _standardise(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        centred = values - values.mean(axis=0)
-        inverse_std = 1.0 / np.sqrt((centred * centred).mean(axis=0) + self.epsilon)
-        return centred * inverse_std, inverse_std
-
-
-def _without_norms(network: nn.Sequential) -> tuple[list[nn.Module], list[nn.LayerNorm]]:
-    """The normalisations where each layer but the last has one right behind it, else none; and all other modules."""
-    modules = list(network)
-    norms = [after for layer, after in pairwise(modules[:-1]) if isinstance(layer, nn.Linear) and _normalises(after, layer)]
-    if len(norms) != sum(isinstance(module, nn.Linear) for module in modules) - 1:
-        return modules, []
-    return [module for module in modules if not any(module is norm for norm in norms)], norms  # type: ignore[return-value]
-
-
-def _normalises(module: nn.Module, layer: nn.Linear) -> bool:
-    if type(module) is not nn.LayerNorm or module.normalized_shape != (layer.out_features,):
-        return False
-    return module.weight is not None and module.bias is not None
-
-
-class _ReverseStep:
-    """The coefficients of a diffusion step."""
-
-    def __init__(self, schedule: NoiseSchedule, step: int, eta: float) -> None:
-        alpha_bar = schedule.alpha_bar_list[step]
-        # a0_hat = clean_by_noisy a^k - clean_by_noise eps
-        self.clean_by_noisy = _constant(alpha_bar**-0.5)
-        self.clean_by_noise = _constant((1.0 / alpha_bar - 1.0) ** 0.5)
-        self.signal = _constant(alpha_bar**0.5)
-        by_clean, by_noisy, self.std = transition_weights(schedule, step, eta)
-        self.by = _constant(by_clean), _constant(by_noisy)
-        self.is_last = step == 0
-
-    def clean(self, noisy_action: np.ndarray, predicted: np.ndarray) -> np.ndarray:
-        """The estimate of the clean action, not clipped."""
-        return self.clean_by_noisy * noisy_action - self.clean_by_noise * predicted
-
-    def next(self, clean: np.ndarray, noisy_action: np.ndarray, scaled_noise: np.ndarray) -> np.ndarray:
-        """From a^k to a^(k-1); the noise has the step's standard deviation."""
-        if self.is_last:
-            return clean
-        by_clean, by_noisy = self.by
-        action = by_clean * clean
-        action += by_noisy * noisy_action
-        action += scaled_noise
-        return action
-
-
-class _Denoiser:
-    """
-    The denoiser and the noise schedule's coefficients of each reverse step.
-
-    Rows of a batch are columns here, as in the critics: weights times a few columns take half the time of a few rows times
-    transposed weights. ``dot`` starts a microsecond earlier than ``@``.
-    """
-
-    def __init__(self, policy: Policy) -> None:
-        actor, denoiser = policy.actor, policy.actor.denoiser
-        weight, self.bias = _layer(denoiser.input_layer)
-        first_time = denoiser.action_dim
-        first_condition = first_time + denoiser.time_table.shape[1]
-        self.action_weight, self.condition_weight = weight[:, :first_time], weight[:, first_condition:]
-        self.time_weight = weight[:, first_time:first_condition]
-        self.time_table = _view(denoiser.time_table).T
-        self.time_layers, self.layers = _linear_layers(denoiser.time_mlp), _linear_layers(denoiser.network)
-        self.activation = ACTIVATIONS[actor.activation_fn].value
-        eta = 1.0 if actor.sampler == "ddpm" else actor.ddim_eta
-        n_steps = actor.schedule.n_steps
-        self.steps = [_ReverseStep(actor.schedule, step, eta) for step in range(n_steps)]
-        # From the last step to the first; the one at position p scales the noise of row p + 1, and the very last one none
-        self.chain = [(k, self.steps[k]) for k in reversed(range(n_steps))]
-        self.stds = np.array([step.std for _, step in self.chain], dtype=np.float32)[:, None, None]
-        self.noise_rows = np.roll(np.arange(n_steps), -1)
-        self.adapting_step = actor.adapting_step
-
-    def time_part(self) -> np.ndarray:
-        """The diffusion steps' part of the first layer, bias included, shape ``(K, width, 1)``."""
-        (weight, bias), (last_weight, last_bias) = self.time_layers
-        embedding = last_weight @ ACTIVATIONS[nn.Mish].value(weight @ self.time_table + bias) + last_bias
-        return (self.time_weight @ embedding + self.bias).T[:, :, None]
-
-    def bind(self, features: np.ndarray, time_part: np.ndarray) -> np.ndarray:
-        """The first layer without the noisy action's part, for each diffusion step, shape ``(K, width, batch)``."""
-        return time_part + self.condition_weight @ features
-
-    def predict_noise(self, noisy_action: np.ndarray, from_rest: np.ndarray) -> np.ndarray:
-        hidden, activation = self.action_weight @ noisy_action, self.activation
-        hidden += from_rest
-        for weight, bias in self.layers:
-            hidden = weight.dot(activation(hidden))
-            hidden += bias
-        return hidden
-
-    def scaled(self, noise: np.ndarray) -> np.ndarray:
-        """What each diffusion step adds of the noise, in the order of the chain, shape ``(K, d, batch)``."""
-        return self.stds * noise[self.noise_rows]
-
-    def sample(
-        self,
-        bound: np.ndarray,
-        action: np.ndarray,
-        scaled_noise: np.ndarray,
-        first_prediction: np.ndarray | None = None,
-        shift: Callable[[np.ndarray, int], np.ndarray] | None = None,
-    ) -> np.ndarray:
-        """
-        The chain of :func:`sb3_causalgdp.diffusion.sample`, from a noisy action of shape ``(d, batch)``. What the denoiser
-        says of the start does not depend on the guidance, so a second chain need not ask again. ``shift`` says by how much the
-        guidance moves a clean estimate.
-        """
-        predicted = first_prediction
-        for position, (k, step) in enumerate(self.chain):
-            if predicted is None:
-                predicted = self.predict_noise(action, bound[k])
-            clean = step.clean(action, predicted)
-            if shift is not None:
-                clean += shift(_clip(clean), k)
-            action, predicted = step.next(_clip(clean), action, scaled_noise[position]), None
-        return action
-
-    def adapt(self, features: np.ndarray, action: np.ndarray, time_part: np.ndarray) -> np.ndarray:
-        """:meth:`DiffusionActor.adapt`, features of shape ``(n, batch)``, actions ``(d, batch)``."""
-        step = self.steps[self.adapting_step]
-        noisy = step.signal * action
-        return _clip(step.clean(noisy, self.predict_noise(noisy, self.bind(features, time_part[self.adapting_step]))))
-
-
-class _Hidden(NamedTuple):
-    """A hidden layer of a critic: what the product gave, the same normalised if the critic is, and the activation of that."""
-
-    product: np.ndarray
-    normalised: np.ndarray
-    output: np.ndarray
-
-    def columns(self, chosen: np.ndarray) -> "_Hidden":
-        return _Hidden(*(part[:, chosen] for part in self))
-
-
-class _Critic:
-    """One target critic."""
-
-    def __init__(self, network: nn.Sequential, activation_fn: type[nn.Module]) -> None:
-        modules, norms = _without_norms(network)
-        self.layers = layers = _linear_layers(modules)
-        self.norms: Sequence[_LayerNorm | None] = [_LayerNorm(norm) for norm in norms] or [None] * (len(layers) - 1)
-        self.activation = ACTIVATIONS[activation_fn]
-
-    def values(self, features: np.ndarray, actions: np.ndarray, n_candidates: int) -> np.ndarray:
-        """Q of several actions for each features; the features' part of the first layer is computed once."""
-        (weight, bias), *layers = self.layers
-        hidden = np.repeat(weight[:, : len(features)] @ features + bias, n_candidates, axis=1)
-        hidden += weight[:, len(features) :] @ actions
-        for norm, (next_weight, next_bias) in zip(self.norms, layers, strict=True):
-            hidden = next_weight.dot(self._hidden(norm, hidden).output)
-            hidden += next_bias
-        return hidden
-
-    def forward(self, inputs: np.ndarray) -> tuple[np.ndarray, list[_Hidden]]:
-        """The values, and the hidden layers."""
-        hidden = []
-        for norm, (weight, bias) in zip(self.norms, self.layers[:-1], strict=True):
-            product = weight.dot(inputs)
-            product += bias
-            hidden.append(self._hidden(norm, product))
-            inputs = hidden[-1].output
-        weight, bias = self.layers[-1]
-        return weight.dot(inputs) + bias, hidden
-
-    def _hidden(self, norm: _LayerNorm | None, product: np.ndarray) -> _Hidden:
-        normalised = product if norm is None else norm(product)
-        return _Hidden(product, normalised, self.activation.value(normalised))
-
-    def backward(self, hidden: list[_Hidden], n_states: int) -> np.ndarray:
-        """Gradient of the values by the states, the first of the inputs."""
-        weights = [weight for weight, _ in self.layers]
-        weights[0] = weights[0][:, :n_states]
-        gradient = weights[-1].T
-        for weight, layer, norm in zip(weights[-2::-1], reversed(hidden), reversed(self.norms), strict=True):
-            gradient = gradient * self.activation.derivative(layer.normalised, layer.output)
-            gradient = weight.T.dot(gradient if norm is None else norm.backward(gradient, layer.product))
-        return gradient
-
-
-class _Critics:
-    """The target critics: the smallest Q, and its gradient by the state."""
-
-    def __init__(self, policy: Policy) -> None:
-        self.networks = [_Critic(network, policy.activation_fn) for network in policy.critic_target.q_networks]
-
-    def values(self, features: np.ndarray, actions: np.ndarray, n_candidates: int) -> np.ndarray:
-        """Smallest Q of several actions for each features."""
-        return reduce(np.minimum, (network.values(features, actions, n_candidates) for network in self.networks))[0]
-
-    def gradient(self, state: np.ndarray, action: np.ndarray) -> np.ndarray:
-        """Of the smallest Q, by the state, shape ``(n, batch)``."""
-        inputs = np.concatenate([state, action])
-        passes = [network.forward(inputs) for network in self.networks]
-        smallest = np.argmin(np.concatenate([values for values, _ in passes]), axis=0)
-        if len(set(smallest.tolist())) == 1:
-            return self.networks[smallest[0]].backward(passes[smallest[0]][1], len(state))
-        gradient = np.empty_like(state)
-        for index, (network, (_, hidden)) in enumerate(zip(self.networks, passes, strict=True)):
-            columns = smallest == index
-            if columns.any():
-                gradient[:, columns] = network.backward([layer.columns(columns) for layer in hidden], len(state))
-        return gradient
-
-
-class _Blocks:
-    """``MaskedBlocks``, whose inputs are masked here, and not its weights, of which there are more."""
-
-    def __init__(self, blocks: MaskedBlocks) -> None:
-        shape = (blocks.n_outputs, blocks.width)
-        self.weight = _view(blocks.input_layer.weight).reshape(*shape, -1)
-        self.bias = _view(blocks.input_layer.bias).reshape(blocks.n_outputs, 1, blocks.width)
-        self.hidden = [
-            (_view(weight), _view(bias)) for weight, bias in zip(blocks.hidden_weights, blocks.hidden_biases, strict=True)
-        ]
-        self.output_weight, self.output_bias = _view(blocks.output_weight), _view(blocks.output_bias)
-
-    def forward_and_jacobian(self, inputs: np.ndarray, mask: np.ndarray, first: int) -> tuple[np.ndarray, np.ndarray]:
-        """Outputs, shape ``(batch, m)``, and their Jacobian by the inputs from the first on, shape ``(m, batch, q)``."""
-        layers = [np.tanh((inputs * mask[:, None]) @ self.weight.transpose(0, 2, 1) + self.bias)]
-        for weight, bias in self.hidden:
-            layers.append(np.tanh(layers[-1] @ weight + bias))
-        outputs = (layers[-1] @ self.output_weight[:, :, None])[:, :, 0].T + self.output_bias
-        gradient = self.output_weight[:, None] * (_ONE - layers[-1] * layers[-1])
-        for (weight, _), hidden in zip(reversed(self.hidden), reversed(layers[:-1]), strict=True):
-            gradient = (gradient @ weight.transpose(0, 2, 1)) * (_ONE - hidden * hidden)
-        return outputs, (gradient @ self.weight[:, :, first:]) * mask[:, None, first:]
-
-
-class _WorldModel:
-    """:meth:`~sb3_causalgdp.causal.MaskedWorldModel.action_response`."""
-
-    def __init__(self, model: MaskedWorldModel) -> None:
-        self.model = model
-        self.transition, self.reward = _Blocks(model.transition), _Blocks(model.reward)
-        self.input_bounds = _constant(-model.INPUT_BOUND), _constant(model.INPUT_BOUND)
-        lowest, highest = model.LOG_STD_BOUNDS
-        self.log_std_bounds = _constant(lowest), _constant(highest)
-        self.arrays = {
-            name: _view(value) for name, value in (*model.named_buffers(recurse=False), *model.named_parameters(recurse=False))
-        }
-
-    def response(self, state: np.ndarray, action: np.ndarray) -> dict[str, np.ndarray]:
-        arrays = self.arrays
-        n_states = state.shape[1]
-        state_std, reward_scale = np.sqrt(arrays["state_unit_square"]), np.sqrt(arrays["reward_unit_square"])
-        gate = arrays["state_to_state"].diagonal()
-        closed = _ONE - gate
-        change = np.minimum(arrays["change_variance"] / (state_std * state_std), _MOST_CHANGE)
-        residual_std = np.maximum(np.sqrt(closed * closed + gate * change), _SMALLEST_RESIDUAL_STD)
-        standardised = (state - arrays["state_mean"]) / state_std
-        inputs = np.concatenate([_clip(standardised, *self.input_bounds), action], axis=1)
-        mask = np.concatenate([arrays["state_to_state"], arrays["action_to_state"]], axis=1)
-        change, jacobian = self.transition.forward_and_jacobian(inputs, mask, n_states)
-        next_standardised = gate * standardised + residual_std * change
-        noise_std = np.exp(_clip(arrays["transition_log_std"], *self.log_std_bounds))
-        reward_inputs = np.concatenate([_clip(next_standardised, *self.input_bounds), action], axis=1)
-        reward_mask = np.concatenate([arrays["state_to_reward"], arrays["action_to_reward"]])[None]
-        reward, reward_gradient = self.reward.forward_and_jacobian(reward_inputs, reward_mask, 0)
-        reward_gradient = reward_scale * reward_gradient[0]
-        within = np.abs(next_standardised) <= self.input_bounds[1]
-        return {
-            "next_state": arrays["state_mean"] + state_std * next_standardised,
-            "next_state_std": noise_std * residual_std * state_std,
-            "standardised_jacobian": (jacobian / noise_std[:, None, None]).transpose(1, 0, 2),
-            "standardised_reward": reward[:, 0],
-            "reward_by_next_state": reward_gradient[:, :n_states] * within / state_std,
-            "reward_by_action": reward_gradient[:, n_states:],
-        }
-
-    def reward_distribution(self, standardised: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Means and standard deviation in the environment's units, from the standardised means."""
-        arrays = self.arrays
-        scale = np.sqrt(arrays["reward_unit_square"])
-        std = np.exp(arrays["reward_log_std"].clip(*self.log_std_bounds)) * scale
-        return arrays["reward_mean"] + scale * standardised, std
-
-
-class _Rule:
-    """``GuidanceRule`` for a guidance that is linear in the clean action."""
-
-    def __init__(self, rule: GuidanceRule, schedule: NoiseSchedule, action_dim: int) -> None:
-        self.mode = rule.mode
-        self.identity = np.eye(action_dim, dtype=np.float32)
-        alpha_bar = np.array(schedule.alpha_bar_list, dtype=np.float32)[:, None, None, None]
-        self.noise = 1.0 - alpha_bar
-        scales = np.asarray(rule.scales, dtype=np.float32).reshape(-1, 1, 1, 1)
-        # Taking sqrt(1 - alpha_bar) G off the noise adds (1 - alpha_bar) / sqrt(alpha_bar) G to the clean estimate
-        self.factor = scales * (self.noise if rule.mode == "posterior" else self.noise / np.sqrt(alpha_bar))
-
-    def shift(self, best: np.ndarray, gradient: np.ndarray, curvature: np.ndarray) -> Callable[[np.ndarray, int], np.ndarray]:
-        """
-        How far the guidance moves the estimate of the clean action, from what ``guidance_shift`` takes off the noise.
-
-        :param best: The action at which the guidance was taken, shape ``(batch, d)``
-        :param gradient: Shape ``(batch, d)``
-        :param curvature: Shape ``(batch, d, d)``
-        :return: Gives the shift of a clean action and a diffusion step, both of shape ``(d, batch)``
-        """
-        # The guidance at the clean action 0; the diffusion steps' factors are found for all of them at once
-        at_zero = gradient[:, :, None] + curvature @ best[:, :, None]
-        if self.mode == "normalized":
-            return lambda clean, step: self.factor[step, 0, 0] * _unit((at_zero - curvature @ clean.T[:, :, None])[:, :, 0]).T
-        if self.mode == "posterior":
-            systems = self.identity + self.noise * curvature
-            size = np.abs(systems).max(axis=(2, 3), keepdims=True)
-            systems += _ROUNDING * size * self.identity
-            both = self.factor * np.linalg.solve(systems, np.concatenate([curvature, at_zero], axis=2))
-            slopes, offsets = both[..., :-1], both[..., -1:]
-        else:
-            slopes, offsets = self.factor * curvature, self.factor * at_zero
-        if len(best) == 1:
-            # The views of several rows take longer than the products
-            slope_of, offset_of = list(slopes[:, 0]), list(offsets[:, 0])
-            return lambda clean, step: offset_of[step] - slope_of[step].dot(clean)
-        return lambda clean, step: (offsets[step] - slopes[step] @ clean.T[:, :, None])[:, :, 0].T
-
-
-def _unit(rows: np.ndarray) -> np.ndarray:
-    return rows / np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-8)
 
 
 def _networks_of(policy: Policy) -> tuple[nn.Module, ...]:
@@ -493,7 +74,7 @@ class HostCopy:
 
 class NumpyActing:
     """
-    What :meth:`CausalGDPPolicy._act` computes, for few rows.
+    What :func:`sb3_causalgdp.prediction.act` computes, for few rows.
 
     :param policy: A policy that :meth:`covers` accepts
     :param copies: Whether to compute on a copy of its weights; by default where they are not in the processor's memory
@@ -505,12 +86,12 @@ class NumpyActing:
     def __init__(self, policy: Policy, copies: bool | None = None) -> None:
         self._copy = HostCopy(policy) if copies or (copies is None and policy.device.type != "cpu") else None
         near = policy if self._copy is None else self._copy.policy
-        self.denoiser = _Denoiser(near)
-        self.critics = _Critics(near)
-        self.world_model = _WorldModel(near.world_model)
-        self.return_std, self.reward_target = _view(near.return_std), _view(near.reward_target)
+        self.denoiser = Denoiser(near)
+        self.critics = Critics(near)
+        self.world_model = WorldModel(near.world_model)
+        self.return_std, self.reward_target = view(near.return_std), view(near.reward_target)
         rule = policy.guidance_rule
-        self.rule = None if rule is None else _Rule(rule, policy.actor.schedule, policy.actor.action_dim)
+        self.rule = None if rule is None else Rule(rule, policy.actor.schedule, policy.actor.action_dim)
         self._blas = ThreadpoolController().select(user_api="blas")
         self._modules = _networks_of(policy)
         self._tensors = HostCopy.tensors_of(policy)
@@ -536,17 +117,18 @@ class NumpyActing:
             GPU of CUDA, and a guidance without the denoiser's Jacobian
         """
         rule, activation = policy.guidance_rule, policy.activation_fn
-        critics = (_without_norms(network)[0] for network in policy.critic_target.q_networks)
+        critics = (without_norms(network)[0] for network in policy.critic_target.q_networks)
         networks: list[Any] = [policy.actor.denoiser.network, *critics]
         return (
-            policy.device.type in ("cpu", "cuda")
+            switch.is_on()
+            and policy.device.type in ("cpu", "cuda")
             and type(policy.observation_space) is spaces.Box
             and not policy.has_image_state
             and type(policy.actor.features_extractor) is FlattenExtractor
             and type(policy.critic_target.features_extractor) is FlattenExtractor
             and type(policy.actor.denoiser) is MLPDenoiser
             and activation in ACTIVATIONS
-            and all(_has_plain_layers(network, activation) for network in networks)
+            and all(has_plain_layers(network, activation) for network in networks)
             and all(parameter.dtype == th.float32 for parameter in policy.parameters())
             and (rule is None or not rule.needs_jacobian)
         )
@@ -594,7 +176,7 @@ class NumpyActing:
         response = self.world_model.response(state, action)
         by_next_state, by_action = response["reward_by_next_state"], response["reward_by_action"]
         if policy.guidance_target == "return":
-            error, std = _ONE, self.return_std
+            error, std = ONE, self.return_std
             by_next_state = by_next_state + np.float32(policy.discount) * self._value_gradient(response, action, time_part)
         else:
             reward, std = self.world_model.reward_distribution(response["standardised_reward"])

@@ -9,6 +9,8 @@ import torch as th
 from torch import nn
 from torch.autograd.function import once_differentiable
 
+from sb3_causalgdp.acceleration import switch
+
 # From here on Mish is its input, also in double precision
 _LARGEST_EXPONENT = 20.0
 _LOG2_E = 1.0 / math.log(2.0)
@@ -34,7 +36,7 @@ def tanh_(x: th.Tensor) -> th.Tensor:
     """
     if th.compiler.is_compiling():
         return 2.0 * th.sigmoid(2.0 * x) - 1.0
-    if x.device.type != "cpu":
+    if x.device.type != "cpu" or not switch.is_on():
         return x.tanh_()
     return _TanhFunction.apply(x) if th.is_grad_enabled() and x.requires_grad else _tanh_in_place(x)  # type: ignore[no-any-return]
 
@@ -103,7 +105,7 @@ class FastMish(nn.Mish):
             # One pass once it is fused; PyTorch's own has a logarithm and a hyperbolic tangent beside the exponential
             s = 1.0 + x.clamp(max=_LARGEST_EXPONENT).exp()
             return x - 2.0 * x / (s * s + 1.0)
-        if x.device.type != "cpu":
+        if x.device.type != "cpu" or not switch.is_on():
             return super().forward(x)
         return _MishFunction.apply(x) if th.is_grad_enabled() and x.requires_grad else mish(x)
 
@@ -113,6 +115,8 @@ def fast(activation_fn: type[nn.Module]) -> Callable[[], nn.Module]:
     :param activation_fn: Class of an activation
     :return: Makes its fastest form for hidden layers: a ReLU writes over its input, which then stays in the cache
     """
+    if not switch.is_on():
+        return activation_fn
     if activation_fn is nn.ReLU:
         return partial(nn.ReLU, inplace=True)
     return FastMish if activation_fn is nn.Mish else activation_fn

@@ -8,6 +8,7 @@ import torch as th
 from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
 from stable_baselines3.common.type_aliases import DictReplayBufferSamples, ReplayBufferSamples
 
+from sb3_causalgdp.acceleration import switch
 from sb3_causalgdp.offline.replay import leaves_of, map_leaves
 
 Columns = dict[str, Any]
@@ -41,7 +42,7 @@ class DeviceReplay:
         :param device: Where batches are needed
         :return: Whether that is a GPU with room for the buffer, and the buffer is one of those whose rows are transitions
         """
-        if device.type != "cuda" or not cls.has_plain_rows(buffer):
+        if device.type != "cuda" or not cls.has_plain_rows(buffer) or not switch.is_on():
             return False
         free, _ = th.cuda.mem_get_info(device)
         needed = sum(values.size * _dtype_of(values).itemsize for values in _arrays(buffer))

@@ -8,6 +8,7 @@ from typing import Any
 
 import torch as th
 
+from sb3_causalgdp.acceleration import switch
 from sb3_causalgdp.acceleration.products import uses_onednn
 
 Gradients = tuple[th.Tensor | None, ...]
@@ -84,7 +85,7 @@ def check_compile(mode: bool | str, device: th.device) -> None:
     :raises ValueError: If the mode is unknown, this PyTorch cannot have a backward pass in a compiled graph, or a CPU's graphs
         find no C++ compiler
     """
-    if mode is False:
+    if mode is False or not switch.is_on():
         return
     # Two seconds, which those who do not compile need not wait
     from torch._inductor.cpp_builder import get_cpp_compiler

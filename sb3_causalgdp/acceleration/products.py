@@ -16,6 +16,8 @@ import torch.nn.functional as F
 from torch import nn
 from torch.utils._python_dispatch import _get_current_dispatch_mode
 
+from sb3_causalgdp.acceleration import switch
+
 LIBRARIES = ("auto", "default", "onednn")
 # Below it, a product with a thin matrix, the other library is as fast or faster
 SMALLEST_SIZE = 16
@@ -49,7 +51,7 @@ def uses_onednn() -> bool:
     """
     :return: Whether linear layers of 32-bit matrices on a CPU are multiplied by oneDNN
     """
-    return _onednn_is_faster() if _chosen == "auto" else _chosen == "onednn"
+    return switch.is_on() and (_onednn_is_faster() if _chosen == "auto" else _chosen == "onednn")
 
 
 @cache

@@ -15,6 +15,7 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 import torch as th
+from stable_baselines3.common.base_class import maybe_make_env
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import VectorizedActionNoise
@@ -27,8 +28,10 @@ from sb3_causalgdp.checkpoints.environments import environment_state, restore_en
 from sb3_causalgdp.checkpoints.pickles import classes_in, from_bytes, to_bytes
 from sb3_causalgdp.checkpoints.store import Checkpoint, open_checkpoint, run_of, write_checkpoint
 from sb3_causalgdp.checkpoints.transitions import FOLDER, Log, rest_of, set_rest
-from sb3_causalgdp.files import replaced_when_done, temporary_folder
+from sb3_causalgdp.files import errors_about, replaced_when_done, temporary_folder
+from sb3_causalgdp.offline.saved_buffers import BUFFERS, check_columns
 from sb3_causalgdp.saving.archives import errors_of
+from sb3_causalgdp.saving.models import check_limits
 from sb3_causalgdp.saving.numpy_pickles import check_random_state
 
 SelfAlgorithm = TypeVar("SelfAlgorithm", bound=OffPolicyAlgorithm)
@@ -109,7 +112,7 @@ def save_checkpoint(
     path = Path(path)
     if path.suffix != ".zip":
         return _save_in_folder(model, path, callback, keep)
-    with temporary_folder(path.absolute().parent) as folder:
+    with temporary_folder(path.absolute().parent) as folder, errors_about(path):
         logs = bookkeeping_of(model).logs
         bookkeeping_of(model).logs = {}
         try:
@@ -228,7 +231,7 @@ def _generators(model: OffPolicyAlgorithm) -> dict[str, Any]:
 def resume(
     algorithm: type[SelfAlgorithm],
     path: str | Path,
-    env: GymEnv | None = None,
+    env: GymEnv | str | None = None,
     device: th.device | str = "auto",
     trusted: bool = False,
 ) -> SelfAlgorithm:
@@ -237,17 +240,18 @@ def resume(
 
     :param algorithm: Class of the model
     :param path: Folder of checkpoints, one of them, or a zip file
-    :param env: Environment that was made as the first one; None where the training needs none
+    :param env: Environment that was made as the first one, or its id; None where the training needs none
     :param device: Device on which the code should be run
     :param trusted: Whether the file may name Python objects that could run code
     :return: The model
     :raises FileNotFoundError: If there is no checkpoint
     :raises ValueError: If none is whole, or the environment is another one
     """
-    with open_checkpoint(Path(path)) as checkpoint:
+    env = None if env is None else maybe_make_env(env, verbose=0)
+    with open_checkpoint(Path(path)) as checkpoint, errors_of(checkpoint.path, "cannot be resumed"):
         # SB3's own algorithms trust every file
         trust: dict[str, Any] = {"trusted": trusted} if "trusted" in inspect.signature(algorithm.load).parameters else {}
-        with checkpoint.read(MODEL) as file, errors_of(checkpoint.path, "cannot be resumed"):
+        with checkpoint.read(MODEL) as file:
             model = algorithm.load(io.BytesIO(file.read()), env=env, device=device, force_reset=False, **trust)
         _check(model, checkpoint)
         own = bookkeeping_of(model)
@@ -255,15 +259,12 @@ def resume(
         own.of_pretraining = checkpoint.manifest["pretraining"]
         own.was_complete = checkpoint.manifest["complete"]
         own.folder = None if checkpoint.path.is_file() else checkpoint.path.absolute().parent
-        try:
-            with checkpoint.read(STATE) as file:
-                allowed = classes_in(model.action_noise, model.replay_buffer)
-                # What learn() makes of an action noise
-                allowed |= {VectorizedActionNoise}
-                state = from_bytes(file.read(), allowed=allowed, trusted=trusted)
-            _restore(model, checkpoint, state, trusted)
-        except ValueError as error:
-            raise ValueError(f"{checkpoint.path}: {error}") from error
+        with checkpoint.read(STATE) as file:
+            allowed = classes_in(model.action_noise, model.replay_buffer)
+            # What learn() makes of an action noise
+            allowed |= {VectorizedActionNoise}
+            state = from_bytes(file.read(), allowed=allowed, trusted=trusted)
+        _restore(model, checkpoint, state, trusted)
     return model
 
 
@@ -277,8 +278,8 @@ def _restore(model: OffPolicyAlgorithm, checkpoint: Checkpoint, state: dict[str,
     environment = state["environment"]
     if environment is not None and model.env is not None and model.env.num_envs != environment["n_envs"]:
         raise ValueError(f"the checkpoint is of {environment['n_envs']} environments, got {model.env.num_envs}")
-    _restore_buffers(model, checkpoint, state["rest"])
-    vars(model).update(state["attributes"])
+    _restore_buffers(model, checkpoint, state["rest"], trusted)
+    vars(model).update({name: value for name, value in state["attributes"].items() if name in ATTRIBUTES})
     own = bookkeeping_of(model)
     own.callbacks = state["callbacks"]
     own.attributes = copy.deepcopy({name: value for name, value in state["attributes"].items() if name in SET_BY_LEARN})
@@ -290,16 +291,20 @@ def _restore(model: OffPolicyAlgorithm, checkpoint: Checkpoint, state: dict[str,
     _set_generators(model, state["generators"])
 
 
-def _restore_buffers(model: Any, checkpoint: Checkpoint, rest: dict[str, Any]) -> None:
+def _restore_buffers(model: Any, checkpoint: Checkpoint, rest: dict[str, Any], trusted: bool) -> None:
     own = bookkeeping_of(model)
     for name, content in checkpoint.manifest["buffers"].items():
         of_buffer = rest[name]
         buffer = model.replay_buffer
+        if not trusted:
+            check_limits({key: of_buffer[key] for key in ("buffer_size", "n_envs")}, 0)
         if name == "offline" or of_buffer["buffer_size"] != buffer.buffer_size:
             buffer = model._new_buffer(of_buffer["buffer_size"] * of_buffer["n_envs"])
         log = Log.from_json(content, buffer)
         log.fill(buffer, checkpoint.read)
         set_rest(buffer, of_buffer)
+        if not trusted and type(buffer) in BUFFERS:
+            check_columns(buffer, f"the replay buffer {name!r}")
         own.logs[name] = log
         setattr(model, "offline_buffer" if name == "offline" else "replay_buffer", buffer)
     if checkpoint.manifest["one_buffer"]:

@@ -12,6 +12,7 @@ from typing import Any, BinaryIO
 
 from sb3_causalgdp.checkpoints.transitions import FOLDER
 from sb3_causalgdp.files import remove_folder, remove_stale, renamed_when_done
+from sb3_causalgdp.saving.archives import checked_entries
 
 FORMAT = 1
 MANIFEST = "manifest.json"
@@ -140,13 +141,20 @@ def _newest_whole(path: Path) -> Checkpoint:
 
 
 def _reader(folder: Path) -> Callable[[str], BinaryIO]:
-    return lambda name: open((folder.parent if name.startswith(f"{FOLDER}/") else folder) / name, "rb")
+    def read(name: str) -> BinaryIO:
+        path = (folder.parent if name.startswith(f"{FOLDER}/") else folder) / name
+        if path.exists() and not path.is_file():
+            raise ValueError(f"{name} is no file")
+        return path.open("rb")
+
+    return read
 
 
 def _opened_zip(path: Path, stack: ExitStack) -> Checkpoint:
     try:
         archive = stack.enter_context(zipfile.ZipFile(path))
-    except zipfile.BadZipFile as error:
+        checked_entries(archive, path.stat().st_size)
+    except (zipfile.BadZipFile, ValueError, NotImplementedError) as error:
         raise ValueError(f"{path} is no checkpoint: {error}") from error
     return _checked(path, lambda name: io.BytesIO(archive.read(name)))
 
@@ -160,6 +168,8 @@ def _checked(path: Path, read: Callable[[str], BinaryIO]) -> Checkpoint:
         if manifest["format"] > FORMAT:
             raise _NotWhole(f"{path} is of format {manifest['format']}, this version reads up to {FORMAT}")
         for name, expected in manifest["files"].items():
+            if Path(name).name != name.removeprefix(f"{FOLDER}/"):
+                raise _NotWhole(f"{path}: {name!r} is no file of a checkpoint")
             with read(name) as file:
                 if _digest(file) != expected:
                     raise _NotWhole(f"{path}: {name} is not what was written")

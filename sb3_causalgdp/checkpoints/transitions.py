@@ -12,6 +12,8 @@ from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from sb3_causalgdp.checkpoints.pickles import from_bytes, to_bytes
 from sb3_causalgdp.files import replaced_when_done
+from sb3_causalgdp.offline.replay import arrays_of
+from sb3_causalgdp.saving.archives import read_arrays
 
 FOLDER = "transitions"
 # Rows of these are never changed once they were written; what other classes do is not known
@@ -116,9 +118,14 @@ class Log:
         columns = dict(_columns(buffer))
         for segment in self.segments:
             first = max(segment.first, self.stored - buffer.buffer_size)
+            if not (Path(segment.name).name == segment.name and 0 <= segment.first <= segment.end <= self.stored):
+                raise ValueError(f"{segment} is not about {self.stored} rows")
             indices = (self.position - (self.stored - np.arange(first, segment.end))) % buffer.buffer_size
-            with read(f"{FOLDER}/{segment.name}") as file, np.load(file, allow_pickle=False) as rows:
+            with read(f"{FOLDER}/{segment.name}") as file:
                 for name, column in columns.items():
+                    rows = read_arrays(file, (name,))
+                    if name not in rows:
+                        raise ValueError(f"{segment.name} lacks {name}")
                     column[indices] = _decoded(rows[name])[first - segment.first :]
 
 
@@ -153,12 +160,10 @@ def set_rest(buffer: ReplayBuffer, rest: dict[str, Any]) -> None:
 
 def _columns(buffer: ReplayBuffer) -> Iterator[tuple[str, np.ndarray]]:
     """By name, those of dictionaries with their key: ``(positions, n_envs, ...)``."""
-    for name, value in vars(buffer).items():
-        if isinstance(value, dict):
-            yield from ((f"{name}/{key}", column) for key, column in value.items() if isinstance(column, np.ndarray))
-        elif isinstance(value, np.ndarray) and value.shape[:2] == (buffer.buffer_size, buffer.n_envs):
-            if name not in CHANGED_LATER and not (name == "infos" and not getattr(buffer, "copy_info_dict", True)):
-                yield name, value
+    left_out = CHANGED_LATER if getattr(buffer, "copy_info_dict", True) else (*CHANGED_LATER, "infos")
+    for name, column in arrays_of(buffer):
+        if "/" in name or (column.shape[:2] == (buffer.buffer_size, buffer.n_envs) and name not in left_out):
+            yield name, column
 
 
 def _indices(buffer: ReplayBuffer, first: int, end: int, stored: int) -> np.ndarray:

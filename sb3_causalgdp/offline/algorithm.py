@@ -5,13 +5,14 @@ import os
 import pathlib
 import time
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from inspect import signature
 from typing import Any, TypeVar
 
 import numpy as np
 from gymnasium import spaces
+from stable_baselines3.common.base_class import maybe_make_env
 from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback, ProgressBarCallback
 from stable_baselines3.common.noise import ActionNoise, VectorizedActionNoise
@@ -34,7 +35,7 @@ from sb3_causalgdp.offline.preload import (
     prime_normalizer,
 )
 from sb3_causalgdp.offline.replay import SpacesEnv, can_sample
-from sb3_causalgdp.offline.rewards import RewardTransform, check_reward_transform
+from sb3_causalgdp.offline.rewards import RewardTransform, SavedRewards, check_reward_transform
 from sb3_causalgdp.offline.saved_buffers import SUFFIXES, can_be_arrays, read_buffer, write_buffer
 from sb3_causalgdp.offline.sources import Source, open_source
 from sb3_causalgdp.offline.spaces import spaces_of
@@ -153,14 +154,15 @@ class OfflineToOnlineAlgorithm(OffPolicyAlgorithm):
         model.env, model.observation_layout = None, layout if layout is not observation_space else None
         return model
 
-    def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
+    def set_env(self, env: GymEnv | str, force_reset: bool = True) -> None:
         """
         Set the environment, see SB3's ``set_env``. A training ``VecNormalize`` counts the preloaded transitions.
 
-        :param env: The environment
+        :param env: The environment, or its id
         :param force_reset: Whether it is reset before training goes on
         :raises ValueError: If its ``VecNormalize`` would normalise the observations of a policy that was trained on others
         """
+        env = maybe_make_env(env, self.verbose)
         normalizer = unwrap_vec_normalize(env) if isinstance(env, VecEnv) else None
         self._check_normalisation(normalizer)
         layout = self._checked_layout(env)
@@ -471,7 +473,11 @@ class OfflineToOnlineAlgorithm(OffPolicyAlgorithm):
             pickled = True
             warnings.warn(f"{type(self.replay_buffer).__name__} is pickled: load_replay_buffer needs trusted=True to read it")
         self.replay_buffer.offline_part = (self.offline_buffer, self._offline_marks)  # type: ignore[attr-defined]
-        more = {"saved_after": self.n_environment_steps, "observation_layout": self.observation_layout}
+        more = {
+            "saved_after": self.n_environment_steps,
+            "observation_layout": self.observation_layout,
+            "reward_transform": self._saved_rewards().to_plain(),
+        }
         vars(self.replay_buffer).update(more)
         try:
             with saved_when_done(path, ".pkl" if pickled else ".npz") as file:
@@ -483,12 +489,33 @@ class OfflineToOnlineAlgorithm(OffPolicyAlgorithm):
             for name in ("offline_part", *more):
                 del vars(self.replay_buffer)[name]
 
+    def _saved_rewards(self) -> SavedRewards:
+        if self._reward_transform is None:
+            return SavedRewards("none", RewardTransform())
+        return SavedRewards(self.reward_transform, self._reward_transform)
+
+    def _check_rewards(self, saved: Any, name: str) -> tuple[SavedRewards, SavedRewards] | None:
+        """What was done to the rewards of a file, and what the model does; None if they may stay, or the file does not say."""
+        if saved is None:
+            return None
+        given, own = SavedRewards.from_plain(saved), self._saved_rewards()
+        if self._reward_transform is None and self.reward_transform != "none":
+            # The model's own numbers come with the first data
+            own = given
+            if given.name not in ("none", self.reward_transform):
+                raise ValueError(
+                    f"{name} holds rewards that were transformed by {given.name!r}, and the model's reward_transform is "
+                    f"{self.reward_transform!r}: pass reward_transform={given.name!r} or 'none' to the model, or preload() it"
+                )
+        return given, own
+
     def load_replay_buffer(
         self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True, *, trusted: bool = False
     ) -> None:
         """
         Load a replay buffer, and the preloaded transitions that were saved with it. When it raises, the model has what it had.
-        Transitions of another number of environments are put into as many columns as the model has environments.
+        Transitions of another number of environments are put into as many columns as the model has environments, and rewards
+        that were saved with another ``reward_transform`` get that of the model.
 
         :param path: Path to the file, as ``.npz`` or pickled; without its suffix, the first of these that is there
         :param truncate_last_traj: See SB3's ``load_replay_buffer``, for ``HerReplayBuffer``
@@ -506,6 +533,7 @@ class OfflineToOnlineAlgorithm(OffPolicyAlgorithm):
         """All or nothing."""
         offline, marks = vars(buffer).pop("offline_part", (None, []))
         self._check_layout(vars(buffer).pop("observation_layout", None), name)
+        rewards = self._check_rewards(vars(buffer).pop("reward_transform", None), name)
         saved_after = vars(buffer).pop("saved_after", self.num_timesteps)
         for one in {id(one): one for one in (buffer, offline) if one is not None}.values():
             if isinstance(one, HerReplayBuffer):
@@ -520,12 +548,22 @@ class OfflineToOnlineAlgorithm(OffPolicyAlgorithm):
             offline = self._fitting(offline, f"{name}, preloaded part")
         if isinstance(online, HerReplayBuffer) and truncate_last_traj:
             online.truncate_last_trajectory()
+        if rewards is not None:
+            self._use_rewards(*rewards, {id(one): one for one in (online, offline) if one is not None}.values())
         self.replay_buffer, self.offline_buffer, self._offline_marks = online, offline, marks
         if saved_after != self.num_timesteps:
             warnings.warn(
                 f"{name} was saved after {saved_after} steps, the model after {self.num_timesteps}: they are not of one "
                 "moment, as they are in a checkpoint of save_checkpoint()"
             )
+
+    def _use_rewards(self, given: SavedRewards, own: SavedRewards, buffers: Iterable[ReplayBuffer]) -> None:
+        if given.transform != own.transform:
+            for buffer in buffers:
+                rows = buffer.rewards[: buffer.size()]
+                rows[:] = own.transform(given.transform.undone(rows))
+        if self._reward_transform is None and own.name == self.reward_transform != "none":
+            self._reward_transform = own.transform
 
     def _fitting(self, buffer: ReplayBuffer, name: str) -> ReplayBuffer:
         check_loaded_buffer(buffer, self.observation_space, self.action_space, name)

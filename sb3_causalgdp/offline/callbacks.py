@@ -1,4 +1,4 @@
-"""Evaluation in normalised scores."""
+"""Evaluation, also in normalised scores."""
 
 from typing import Any
 
@@ -7,10 +7,29 @@ import numpy as np
 from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_causalgdp.files import replaced_when_done
 from sb3_causalgdp.offline.scores import NormalizedScore, normalized_score
 
 
-class NormalizedEvalCallback(EvalCallback):
+class WholeEvalCallback(EvalCallback):
+    """
+    SB3's :class:`~stable_baselines3.common.callbacks.EvalCallback`, whose ``evaluations.npz`` is replaced only once the new
+    one is complete.
+    """
+
+    def _on_step(self) -> bool:
+        path = self.log_path
+        if path is None or self.eval_freq <= 0 or self.n_calls % self.eval_freq != 0:
+            return super()._on_step()
+        with replaced_when_done(f"{path}.npz") as file:
+            self.log_path = str(file)
+            try:
+                return super()._on_step()
+            finally:
+                self.log_path = path
+
+
+class NormalizedEvalCallback(WholeEvalCallback):
     """
     SB3's :class:`~stable_baselines3.common.callbacks.EvalCallback`, which also logs ``eval/normalized_score`` and keeps it as
     ``last_normalized_score``.

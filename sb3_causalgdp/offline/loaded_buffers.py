@@ -7,6 +7,7 @@ from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.preprocessing import get_obs_shape
 
+from sb3_causalgdp.checks import many_are_finite
 from sb3_causalgdp.offline.preload import preload_buffer
 from sb3_causalgdp.offline.sources import BufferSource, as_flags
 
@@ -29,7 +30,7 @@ def check_loaded_buffer(
             wanted = (buffer.buffer_size, buffer.n_envs, *shape)
             raise ValueError(f"{name} is damaged: its {field} have the shape {values.shape}, and {wanted} is needed")
         held = values[: buffer.size()]
-        if np.issubdtype(held.dtype, np.floating) and not np.isfinite(held).all():
+        if not many_are_finite(held):
             position, column, *where = np.argwhere(~np.isfinite(held))[0].tolist()
             raise ValueError(
                 f"{name} has a NaN or infinite value in {field}{where or ''} at position {position} of environment {column}"

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
+import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
@@ -61,6 +62,18 @@ def leaves_of(part: Any) -> Iterator[Any]:
     :return: Its arrays or tensors
     """
     yield from part.values() if isinstance(part, dict) else (part,)
+
+
+def arrays_of(buffer: ReplayBuffer) -> Iterator[tuple[str, np.ndarray]]:
+    """
+    :param buffer: A replay buffer
+    :return: Its arrays by the attribute's name, those of dictionaries by name and key, as in ``observations/position``
+    """
+    for name, value in vars(buffer).items():
+        if isinstance(value, dict):
+            yield from ((f"{name}/{key}", part) for key, part in value.items() if isinstance(part, np.ndarray))
+        elif isinstance(value, np.ndarray):
+            yield name, value
 
 
 def deal_rows(sample: Any, n_parts: int) -> Any:

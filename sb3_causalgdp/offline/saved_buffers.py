@@ -12,6 +12,9 @@ from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer
 from stable_baselines3.her.goal_selection_strategy import GoalSelectionStrategy
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
+from sb3_causalgdp.checks import many_are_finite
+from sb3_causalgdp.offline.replay import arrays_of
+from sb3_causalgdp.offline.rewards import SavedRewards
 from sb3_causalgdp.saving.archives import errors_of, is_zip, named, opened, read_arrays, read_pickle, write_arrays
 from sb3_causalgdp.saving.plain import FORMAT, SPACES, Known, NotPlainError, Writer, decoded, read_json
 
@@ -19,6 +22,8 @@ SUFFIXES = (".npz", ".pkl")
 BUFFERS = (ReplayBuffer, DictReplayBuffer, NStepReplayBuffer, HerReplayBuffer)
 KNOWN = Known([*SPACES, GoalSelectionStrategy], BUFFERS)
 CONTENT, BLOCK, OFFLINE = "buffer", "block", "offline/"
+# Attributes that our algorithm gives a buffer while it is written
+ADDED = ("saved_after", "observation_layout", "reward_transform")
 NOT_WRITTEN = ("env", "device", "offline_part", "infos")
 MOST_ROWS = 100_000_000
 MOST_GOALS = 1_000
@@ -78,11 +83,9 @@ def _n_rows(buffer: ReplayBuffer) -> int:
 
 def _columns(buffer: ReplayBuffer) -> Iterator[tuple[str, np.ndarray]]:
     """By name, those of dictionaries with their key: ``(positions, n_envs, ...)``."""
-    for name, value in vars(buffer).items():
-        if isinstance(value, dict):
-            yield from ((f"{name}/{key}", column) for key, column in value.items() if isinstance(column, np.ndarray))
-        elif isinstance(value, np.ndarray) and value.ndim >= 2 and name not in NOT_WRITTEN:
-            yield name, value
+    for name, column in arrays_of(buffer):
+        if "/" in name or (column.ndim >= 2 and name not in NOT_WRITTEN):
+            yield name, column
 
 
 # Reading ----------------------------------------------------------------------------------------------------------------
@@ -136,12 +139,13 @@ def _one_buffer(arrays: dict[str, np.ndarray], name_of_buffer: str) -> tuple[Rep
         raise ValueError("it says of no replay buffer what it is")
     content = decoded(read_json(arrays.pop(CONTENT).tobytes()), arrays.pop(BLOCK).tobytes(), KNOWN)
     buffer = _empty(content)
-    # The last is what our algorithm adds
-    names = [name for name in (*vars(buffer), "saved_after", "observation_layout") if name in content]
+    names = [name for name in (*vars(buffer), *ADDED) if name in content]
     if type(content.get("saved_after", 0)) is not int:
         raise ValueError(f"saved_after must be a number of steps, got {str(content['saved_after'])[:80]}")
     if not isinstance(content.get("observation_layout"), spaces.Space | None):
         raise ValueError(f"observation_layout must be a space, got {str(content['observation_layout'])[:80]}")
+    if "reward_transform" in content:
+        SavedRewards.from_plain(content["reward_transform"])
     vars(buffer).update({name: content[name] for name in names})
     _fill(buffer, arrays)
     check_columns(buffer, name_of_buffer)
@@ -266,9 +270,7 @@ def _small(buffer: ReplayBuffer) -> ReplayBuffer:
 def _check_finite(columns: Mapping[str, np.ndarray], n_rows: int, name_of_buffer: str) -> None:
     for name, column in columns.items():
         stored = column[:n_rows]
-        # The sum is much faster, and finite where all are
-        with np.errstate(over="ignore", invalid="ignore"):
-            if column.dtype.kind == "f" and not np.isfinite(stored.sum()) and not np.isfinite(stored).all():
-                position, column_of, *where = np.argwhere(~np.isfinite(stored))[0].tolist()
-                place = f"{name}{where or ''} at position {position} of environment {column_of}"
-                raise ValueError(f"{name_of_buffer} has a NaN or infinite value in {place}")
+        if not many_are_finite(stored):
+            position, column_of, *where = np.argwhere(~np.isfinite(stored))[0].tolist()
+            place = f"{name}{where or ''} at position {position} of environment {column_of}"
+            raise ValueError(f"{name_of_buffer} has a NaN or infinite value in {place}")

@@ -12,6 +12,7 @@ from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
 
 from sb3_causalgdp.offline.extras import OFFLINE_HINT
+from sb3_causalgdp.offline.rewards import RewardTransform, SavedRewards
 from sb3_causalgdp.offline.saved_buffers import SUFFIXES, is_buffer, read_buffer
 from sb3_causalgdp.saving.archives import errors_of, existing, load_minari, one_line, read_arrays
 from sb3_causalgdp.sources.columns import SUFFIXES as TABLE_SUFFIXES
@@ -173,7 +174,7 @@ class MinariSource(Source):
 class BufferSource(Source):
     """
     A replay buffer of SB3: the trajectory of each environment, one after the other. The preloaded transitions that were saved
-    with it come first.
+    with it come first. Rewards are those of the environment, also where the buffer was saved with transformed ones.
 
     :param buffer: The buffer
     :param name: What to call it
@@ -183,6 +184,8 @@ class BufferSource(Source):
 
     def __init__(self, buffer: ReplayBuffer, name: str = "The replay buffer") -> None:
         self.layout = getattr(buffer, "observation_layout", None)
+        done = getattr(buffer, "reward_transform", None)
+        self.reward_transform = None if done is None else SavedRewards.from_plain(done).transform
         dropped = "next_observations" if getattr(buffer, "optimize_memory_usage", False) else None
         missing = [field for field in BUFFER_FIELDS if field != dropped and not hasattr(buffer, field)]
         if missing:
@@ -214,10 +217,14 @@ class BufferSource(Source):
                 _rows_of(buffer.observations, (rows, column)),
                 _rows_of(buffer.next_observations, (rows, column)),
                 buffer.actions[rows, column],
-                buffer.rewards[rows, column],
+                self._raw(buffer.rewards[rows, column]),
                 terminations,
                 truncations,
             )
+
+    def _raw(self, rewards: np.ndarray) -> np.ndarray:
+        changed = self.reward_transform not in (None, RewardTransform())
+        return self.reward_transform.undone(rewards) if changed else rewards  # type: ignore[union-attr]
 
 
 def preloaded_part_of(buffer: ReplayBuffer) -> ReplayBuffer | None:

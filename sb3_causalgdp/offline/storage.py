@@ -11,7 +11,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from sb3_causalgdp.files import move_folder, temporary_folder
+from sb3_causalgdp.files import errors_about, move_folder, temporary_folder
 from sb3_causalgdp.offline.extras import need
 from sb3_causalgdp.offline.scores import find_reference
 
@@ -115,13 +115,14 @@ def write_dataset(
     :param metadata: Of :func:`minari.create_dataset_from_buffers`
     :return: the dataset's folder
     :raises ValueError: if the id is malformed or taken
+    :raises OSError: if it cannot be written, on a full disk for instance; nothing is left of it then
     """
     check_new_dataset(dataset_id, root)
     minari = need("minari")
     environment = make_environment(environment_id, max_episode_steps)
     reference = find_reference(dataset_id)
-    with temporary_folder(root) as staging, closing(environment):
-        with minari_root(staging), warnings.catch_warnings():
+    with temporary_folder(root) as staging, errors_about(root / dataset_id), closing(environment):
+        with minari_root(staging), _own_files(), warnings.catch_warnings():
             # An author's e-mail and a permalink are for datasets that get published
             warnings.filterwarnings("ignore", message="`(author|author_email|code_permalink)` is set to None")
             warnings.filterwarnings("ignore", message=OUTDATED)
@@ -152,6 +153,84 @@ def _buffers(episodes: Iterable[Episode]) -> Iterator[Any]:
             truncations=ends[1],
             infos=episode.infos,
         )
+
+
+class _File:
+    """
+    What HDF5 writes to. It never hears of a disk that takes no more, because it ends the process when it cannot write what it
+    still has in memory; ``error`` keeps what was raised.
+
+    :param file: Opened for reading and writing, without a buffer
+    """
+
+    def __init__(self, file: Any) -> None:
+        self.file = file
+        self.error: OSError | None = None
+        self.seek, self.tell = file.seek, file.tell
+
+    def readinto(self, buffer: Any) -> int:
+        return self.file.readinto(buffer)
+
+    def read(self, size: int = -1) -> bytes:
+        return self.file.read(size)
+
+    def write(self, data: Any) -> int:
+        left = memoryview(data).cast("B")
+        n_bytes = len(left)
+        try:
+            while self.error is None and len(left) > 0:
+                left = left[self.file.write(left) :]
+        except OSError as error:
+            self.error = error
+        return n_bytes
+
+    def truncate(self, size: int) -> int:
+        try:
+            if self.error is None:
+                self.file.truncate(size)
+        except OSError as error:
+            self.error = error
+        return size
+
+    def flush(self) -> None:
+        """There is no buffer."""
+
+    def check(self) -> None:
+        if self.error is not None:
+            raise self.error
+
+
+@contextmanager
+def _own_files() -> Iterator[None]:
+    """Let Minari give its HDF5 library a :class:`_File` in place of a path."""
+    storage_class = need("minari.dataset._storages.hdf5_storage").HDF5Storage
+    update = storage_class.update_episodes
+
+    def update_episodes(storage: Any, episodes: Iterable[Any]) -> None:
+        path = storage._file_path
+        with path.open("r+b", buffering=0) as opened:
+            file = storage._file_path = _File(opened)
+            try:
+                update(storage, _until_error(episodes, file))
+            except Exception:
+                # HDF5 may have stumbled over what is not there
+                file.check()
+                raise
+            finally:
+                storage._file_path = path
+            file.check()
+
+    storage_class.update_episodes = update_episodes
+    try:
+        yield
+    finally:
+        storage_class.update_episodes = update
+
+
+def _until_error(episodes: Iterable[Any], file: _File) -> Iterator[Any]:
+    for episode in episodes:
+        yield episode
+        file.check()
 
 
 def _publish(dataset_id: str, staging: Path, root: Path) -> None:

@@ -12,7 +12,7 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common import torch_layers
 from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise, VectorizedActionNoise
-from stable_baselines3.common.save_util import is_json_serializable
+from stable_baselines3.common.save_util import is_json_serializable, load_from_zip_file, open_path
 from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
 from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule, LinearSchedule
 from stable_baselines3.her.goal_selection_strategy import GoalSelectionStrategy
@@ -28,7 +28,7 @@ from sb3_causalgdp.causal.statistics.recent_rows import RecentRows
 from sb3_causalgdp.causal.variables import TransitionVariables
 from sb3_causalgdp.offline.rewards import RewardTransform
 from sb3_causalgdp.offline.saved_buffers import BUFFERS
-from sb3_causalgdp.saving.archives import TRUST, check_sums, checked_entries, size_of
+from sb3_causalgdp.saving.archives import TRUST, check_sums, checked_entries, errors_of, size_of
 from sb3_causalgdp.saving.plain import FORMAT, SPACES, Known, NotPlainError, Writer, decoded, read_json
 
 CONTENT, BLOCK = "plain.json", "plain.bin"
@@ -155,6 +155,30 @@ def read_values(file: BinaryIO, known: Known, given: Collection[str], trusted: b
         _check_attributes(read, saved, plain, methods)
         check_limits(read, size)
     return SavedValues({name: value for name, value in plain.items() if name not in given}, frozenset(saved))
+
+
+def read_parameters(path: Any, device: Any) -> dict[str, Any]:
+    """
+    The tensors of a saved model, without its attributes. None of it is run, and none is unpacked that is out of proportion.
+
+    :param path: Its path, or a file-like object
+    :param device: Device on which they should be
+    :return: What ``set_parameters`` takes
+    :raises ValueError: If the file is not whole, or not a saved model
+    """
+    file = open_path(path, "r", suffix="zip")
+    try:
+        with errors_of(path, "cannot be loaded"):
+            position, size = file.tell(), size_of(file)
+            with zipfile.ZipFile(file) as archive:
+                entries = checked_entries(archive, size)
+                check_sums(archive, entries)
+                _check_tensors(archive, entries)
+            file.seek(position)
+            return load_from_zip_file(file, device=device, load_data=False)[1]
+    finally:
+        if file is not path:
+            file.close()
 
 
 def read_plain(archive: zipfile.ZipFile, known: Known, given: Collection[str] = ()) -> dict[str, Any]:

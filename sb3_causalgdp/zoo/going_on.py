@@ -89,11 +89,16 @@ def cut_monitors(folder: Path, steps_per_environment: int) -> None:
     :param steps_per_environment: At the checkpoint
     """
     for path in folder.glob("*.monitor.csv"):
-        with path.open(newline="", encoding="utf-8") as file:
-            header, names, *rows = file.readline(), *csv.reader(file)
-        length, kept, steps = names.index("l"), [], 0
-        for row in rows:
-            steps += int(row[length])
+        with path.open(newline="", encoding="utf-8", errors="replace") as file:
+            header, rows = file.readline(), list(csv.reader(file))
+        if not rows or "l" not in rows[0]:
+            continue
+        names, kept, steps = rows[0], [], 0
+        for row in rows[1:]:
+            # A row that was cut off is of the last episode
+            if len(row) != len(names) or not row[names.index("l")].isdigit():
+                break
+            steps += int(row[names.index("l")])
             if steps > steps_per_environment:
                 break
             kept.append(row)

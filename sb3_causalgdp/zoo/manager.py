@@ -27,8 +27,8 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_causalgdp import CausalGDP, TrainingCheckpointCallback
 from sb3_causalgdp.checkpoints.store import is_checkpoint
-from sb3_causalgdp.files import replaced_when_done
-from sb3_causalgdp.offline.callbacks import NormalizedEvalCallback
+from sb3_causalgdp.files import replaced_when_done, temporary_folder
+from sb3_causalgdp.offline.callbacks import NormalizedEvalCallback, WholeEvalCallback
 from sb3_causalgdp.offline.scores import find_reference
 from sb3_causalgdp.zoo.going_on import FOLDER as CHECKPOINTS
 from sb3_causalgdp.zoo.going_on import RunLock, cut_monitors, interrupted_run, new_folder, write_command
@@ -143,7 +143,12 @@ class CausalGDPExperimentManager(ExperimentManager):
     def _save_config(self, saved_hyperparams: dict[str, Any]) -> None:
         if self._manifest is not None:
             return
-        super()._save_config(saved_hyperparams)
+        with temporary_folder(Path(self.params_path)) as folder:
+            with replaced(self, "params_path", str(folder)):
+                super()._save_config(saved_hyperparams)
+            for name in ("args.yml", "config.yml"):
+                with replaced_when_done(Path(self.params_path, name)) as file:
+                    shutil.copyfile(folder / name, file)
         versions = yaml.safe_dump(installed_versions(), sort_keys=False, allow_unicode=True)
         # RL Zoo's command lacks the shell's quotes
         for name, text in {"command.txt": shlex.join(sys.orig_argv), "versions.yml": versions}.items():
@@ -167,6 +172,13 @@ class CausalGDPExperimentManager(ExperimentManager):
         if isinstance(model, CausalGDP):
             # Again, with what RL Zoo does not ask for
             model.save(f"{self.save_path}/{self.env_name}", include=["causal_graph_history"])
+
+    def _maybe_normalize(self, env: VecEnv, eval_env: bool) -> VecEnv:
+        if self._manifest is None:
+            return super()._maybe_normalize(env, eval_env)
+        # The checkpoint has newer statistics than the file that RL Zoo would look for
+        with replaced(self, "trained_agent", os.path.join(self.trained_agent, "none")):
+            return super()._maybe_normalize(env, eval_env)
 
     # Training -----------------------------------------------------------------------------------------------------------
 
@@ -223,7 +235,7 @@ class CausalGDPExperimentManager(ExperimentManager):
                 }
                 task = model.offline_dataset or ""
                 if find_reference(task) is None:
-                    callbacks.append(EvalCallback(online.eval_env, **kwargs))
+                    callbacks.append(WholeEvalCallback(online.eval_env, **kwargs))
                 else:
                     callbacks.append(NormalizedEvalCallback(online.eval_env, task, **kwargs))
         return callbacks

@@ -13,7 +13,7 @@ from typing import Any
 
 from sb3_causalgdp.saving.archives import errors_of, read_pickle
 from sb3_causalgdp.zoo.registration import ALGORITHM, ZOO_HINT
-from sb3_causalgdp.zoo.settings import safe_files
+from sb3_causalgdp.zoo.settings import safe_files, whole_files
 
 MODULE = "sb3_causalgdp.zoo"
 
@@ -160,7 +160,7 @@ SURROUNDINGS: dict[str, list[Callable[[], Any]]] = {
     "push_to_hub": [safe_files, model_card_metadata, own_model_card, ffmpeg_on_path],
     "record_video": [safe_files],
     "record_training": [own_commands, ffmpeg_on_path],
-    "train": [safe_files],
+    "train": [safe_files, whole_files],
 }
 """By script."""
 

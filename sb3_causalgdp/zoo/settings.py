@@ -13,6 +13,8 @@ import gymnasium as gym
 import yaml
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecNormalize
 
+from sb3_causalgdp.files import replaced_when_done
+from sb3_causalgdp.offline.callbacks import WholeEvalCallback
 from sb3_causalgdp.saving.archives import errors_of, read_pickle
 
 TAG = "tag:yaml.org,2002:python/"
@@ -174,6 +176,23 @@ def _check_wrapper(name: str) -> None:
         return  # RL Zoo says so
     if not (isinstance(wrapper, type) and issubclass(wrapper, gym.Wrapper | VecEnvWrapper)):
         raise ValueError(f"the run names {name!r}, which is no wrapper and could run code: if you trust it, use --trusted")
+
+
+@contextmanager
+def whole_files() -> Iterator[None]:
+    """RL Zoo's normalizations and evaluations are replaced only once the new ones are complete, as all that we write."""
+    from rl_zoo3 import exp_manager
+
+    from sb3_causalgdp.zoo.scripts import replaced
+
+    save = VecNormalize.save
+
+    def save_whole(normalizer: VecNormalize, save_path: str) -> None:
+        with replaced_when_done(save_path) as file:
+            save(normalizer, str(file))
+
+    with replaced(VecNormalize, "save", save_whole), replaced(exp_manager, "EvalCallback", WholeEvalCallback):
+        yield
 
 
 @contextmanager

@@ -12,6 +12,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from sb3_causalgdp import CausalGDP
 from sb3_causalgdp.acceleration.acting import NumpyActing
 from sb3_causalgdp.offline.replay import SpacesEnv
+from sb3_causalgdp.prediction import act, act_in_torch, candidate_noise
 
 N_STATES, N_ACTIONS = 5, 3
 
@@ -48,10 +49,10 @@ def both_paths(policy, observations, deterministic=False):
     observations = th.as_tensor(observations)
     with th.no_grad():
         th.manual_seed(3)
-        fast = policy._act(observations, deterministic)
+        fast = act(policy, observations, deterministic)
         th.manual_seed(3)
-        noise = policy._candidate_noise(len(observations), deterministic)
-        return fast, policy._act_in_torch(observations, policy.actor.features(observations), noise)
+        noise = candidate_noise(policy, len(observations), deterministic)
+        return fast, act_in_torch(policy, observations, policy.actor.features(observations), noise)
 
 
 @pytest.mark.parametrize(("state_unit", "reward_unit"), [(1.0, 1e-9), (1e-6, 1.0), (0.0, 1.0), (1.0, 0.0)])
@@ -192,7 +193,7 @@ def test_what_is_not_covered_takes_the_plain_path(kwargs):
     rows = states(2)
     observation = {"a": th.as_tensor(rows)} if isinstance(policy.observation_space, spaces.Dict) else th.as_tensor(rows)
     with th.no_grad():
-        assert policy._act(observation, True).shape == (2, N_ACTIONS)
+        assert act(policy, observation, True).shape == (2, N_ACTIONS)
     assert policy._acting is None
 
 
@@ -218,7 +219,7 @@ def test_many_rows_take_the_plain_path(monkeypatch):
     monkeypatch.setattr(NumpyActing, "__call__", lambda *args: pytest.fail("numpy"))
     n_rows = NumpyActing.MOST_ROWS // policy.n_action_candidates + 1
     with th.no_grad():
-        policy._act(th.as_tensor(states(n_rows)), True)
+        act(policy, th.as_tensor(states(n_rows)), True)
 
 
 def test_collecting_and_predicting_use_it(monkeypatch):

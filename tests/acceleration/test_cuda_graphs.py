@@ -29,7 +29,7 @@ SETTINGS = {
 
 def states_of(model):
     """Every tensor that a gradient step writes."""
-    states = [state for optimizer in model._optimizers() for state in optimizer.state.values()]
+    states = [state for optimizer in model._updates.optimizers() for state in optimizer.state.values()]
     return [*model.policy.state_dict().values(), *(value for state in states for value in state.values())]
 
 
@@ -67,8 +67,8 @@ def copies(model, path):
         one.load_replay_buffer(path / "buffer")
         one.set_logger(Logger(None, []))
         one._n_updates += 100  # behind the first hundred, whose running averages have weights of their own
-    loaded[0]._update_graphs = None
-    loaded[1]._update_graphs = UpdateGraphs(loaded[1]._optimizers(), recorder_of(loaded[1]))
+    loaded[0]._updates.fast.graphs = None
+    loaded[1]._updates.fast.graphs = UpdateGraphs(loaded[1]._updates.optimizers(), recorder_of(loaded[1]))
     return loaded
 
 
@@ -89,7 +89,7 @@ def test_recorded_steps_train_as_plain_ones(name, device, tmp_path):
     plain, recorded = copies(model, tmp_path)
     expected, logged = train(plain), train(recorded)
     # One for each critic that is climbed and each pair of networks that are updated together
-    assert len(recorded._update_graphs._recordings) >= 2
+    assert len(recorded._updates.fast.graphs._recordings) >= 2
     assert_same_weights(recorded.policy.state_dict(), plain.policy.state_dict(), rtol=1e-4, atol=1e-5)
     for ours, theirs in zip(logged, expected, strict=True):
         assert ours == pytest.approx(theirs, rel=1e-3, abs=1e-5)
@@ -117,7 +117,7 @@ def test_recorded_steps_train_on_images(device, tmp_path):
     both = copies(trained_model("CnnPolicy", env, device=device, policy_kwargs=policy_kwargs), tmp_path)
     for model in both:
         train(model)
-    assert len(both[1]._update_graphs._recordings) >= 2
+    assert len(both[1]._updates.fast.graphs._recordings) >= 2
     assert_same_weights(both[1].policy.state_dict(), both[0].policy.state_dict(), rtol=1e-3, atol=1e-4)
 
 
@@ -177,6 +177,6 @@ def test_what_stands_in_the_way_is_said(changed, reason):
 
 def test_parameters_that_are_set_have_recordings_of_their_own(tmp_path):
     model = copies(trained_model(device="cpu"), tmp_path)[1]
-    before, graphs = model.get_parameters(), model._update_graphs
+    before, graphs = model.get_parameters(), model._updates.fast.graphs
     model.set_parameters(before)
-    assert model._update_graphs is not graphs
+    assert model._updates.fast.graphs is not graphs

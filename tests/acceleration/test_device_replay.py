@@ -110,7 +110,7 @@ def test_training_draws_from_the_copy_and_the_same_for_the_same_seed():
     for _ in range(2):
         model = CausalGDP("MlpPolicy", "Pendulum-v1", buffer_size=150, learning_starts=100, **KWARGS)
         model.learn(220)  # over the end of the buffer
-        copy = model._device_replay(model.replay_buffer)
+        copy = model._updates.batches.on_device(model.replay_buffer)
         copy.copy_new_rows()
         np.testing.assert_allclose(copy.columns["observations"].numpy(), model.replay_buffer.observations)
         weights.append(th.nn.utils.parameters_to_vector(model.policy.parameters()))
@@ -125,17 +125,17 @@ def test_offline_and_online_transitions_have_a_copy_each_and_none_is_saved(tmp_p
     rows |= {"actions": rng.uniform(-2, 2, (50, 1)), "rewards": rng.standard_normal(50)}
     rows |= {"terminations": np.zeros(50), "truncations": np.arange(50) == 49}
     model.preload(rows).pretrain(3)
-    assert list(model._device_replays) == ["offline"]
+    assert list(model._updates.batches._on_device) == ["offline"]
     model.preload({**rows, "rewards": rows["rewards"] + 1.0})
     model.learn(20)
-    assert set(model._device_replays) == {"offline", "online"}
-    assert model._device_replay(model.offline_buffer).sample(1_000).rewards.unique().numel() == 100
+    assert set(model._updates.batches._on_device) == {"offline", "online"}
+    assert model._updates.batches.on_device(model.offline_buffer).sample(1_000).rewards.unique().numel() == 100
     model.save(tmp_path / "model")
-    assert CausalGDP.load(tmp_path / "model")._device_replays == {}
+    assert CausalGDP.load(tmp_path / "model")._updates.batches._on_device == {}
 
 
 @pytest.mark.usefixtures("copies_on_a_cpu")
 def test_observations_that_are_normalised_anew_are_not_copied():
     env = VecNormalize(DummyVecEnv([lambda: gym.make("Pendulum-v1")]))
     model = CausalGDP("MlpPolicy", env, learning_starts=20, **KWARGS).learn(30)
-    assert model._device_replays == {}
+    assert model._updates.batches._on_device == {}

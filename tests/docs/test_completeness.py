@@ -48,9 +48,19 @@ def public_names(file):
     return [name for name in defined if not name.startswith("_")]
 
 
+MODULES = (
+    "callbacks/diagnostics",
+    "callbacks/pictures",
+    "losses",
+    "networks",
+    "policies",
+    "prediction",
+    "questions",
+    "updates",
+)
 PUBLIC_MODULES = [
     *(file for file in sorted(PACKAGE.rglob("__init__.py")) if file.read_text(encoding="utf-8").strip()),
-    *(PACKAGE / f"{name}.py" for name in ("callbacks/diagnostics", "callbacks/pictures", "losses", "policies", "structural")),
+    *(PACKAGE / f"{name}.py" for name in MODULES),
 ]
 
 

@@ -12,6 +12,7 @@ from gymnasium import spaces
 from stable_baselines3 import SAC, HerReplayBuffer
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.save_util import save_to_pkl
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_causalgdp import CausalGDP
@@ -294,6 +295,79 @@ def test_reward_transforms(name, dataset, episodes):
     model._last_obs = env.reset()
     model._store_transition(model.replay_buffer, np.zeros((1, 1)), model._last_obs, np.array([2.0]), [False], [{}])
     assert model.replay_buffer.rewards[model.replay_buffer.pos - 1, 0] == pytest.approx(2.0 * scale + shift, rel=1e-5)
+
+
+def raw_and_saved(folder, name, suffix):
+    """Rewards of the environment, offline and online, and a buffer that was saved with what ``name`` makes of them."""
+    # Random actions, which do not follow from rewards
+    raw = [make(learning_starts=50, reward_transform=one).preload(ARRAYS) for one in ("none", name)]
+    for model in raw:
+        model.learn(20)
+    path = folder / f"buffer{suffix}"
+    raw[1].save_replay_buffer(path)
+    offline, online = (getattr(raw[0], one).rewards for one in ("offline_buffer", "replay_buffer"))
+    assert not np.allclose(raw[1].offline_buffer.rewards[:15], offline[:15])
+    return np.concatenate([offline[:15, 0], online[:20, 0]]), path, raw[1]
+
+
+ARRAYS = {
+    "observations": np.zeros((15, 3)),
+    "actions": np.zeros((15, 1)),
+    "rewards": np.arange(15.0),
+    "next_observations": np.zeros((15, 3)),
+    "terminations": np.arange(15) % 5 == 4,
+    "truncations": np.zeros(15, bool),
+}
+
+
+@pytest.mark.parametrize("suffix", [".npz", ".pkl"])
+@pytest.mark.parametrize("name", ["antmaze", "normalize"])
+def test_transformed_rewards_that_were_saved_are_not_transformed_twice(name, suffix, tmp_path):
+    raw, path, model = raw_and_saved(tmp_path, name, suffix)
+    np.testing.assert_allclose(make().preload(path).offline_buffer.rewards[:35, 0], raw, rtol=1e-5, atol=1e-5)
+    again = make(reward_transform="antmaze").preload(path).offline_buffer.rewards[:35, 0]
+    np.testing.assert_allclose(again, 4.0 * raw - 2.0, rtol=1e-5, atol=1e-4)
+    # Whose it is, has it as it was
+    own = make(reward_transform=name)
+    own.load_replay_buffer(path)
+    for one in ("offline_buffer", "replay_buffer"):
+        np.testing.assert_array_equal(getattr(own, one).rewards, getattr(model, one).rewards)
+    assert own._reward_transform == model._reward_transform
+    # A model of the environment's rewards goes on with those
+    plain = make()
+    plain.load_replay_buffer(path)
+    both = np.concatenate([plain.offline_buffer.rewards[:15, 0], plain.replay_buffer.rewards[:20, 0]])
+    np.testing.assert_allclose(both, raw, rtol=1e-5, atol=1e-5)
+    with pytest.raises(ValueError, match=f"transformed by '{name}', and the model's reward_transform is 'antmaze_iql'"):
+        make(reward_transform="antmaze_iql").load_replay_buffer(path)
+
+
+def test_a_buffer_of_raw_rewards_gets_the_models_transform(tmp_path):
+    model = make().learn(20)
+    model.save_replay_buffer(tmp_path / "buffer")
+    other = make(reward_transform="antmaze").preload(ARRAYS)
+    other.load_replay_buffer(tmp_path / "buffer")
+    np.testing.assert_allclose(other.replay_buffer.rewards[:20], 4.0 * model.replay_buffer.rewards[:20] - 2.0, rtol=1e-6)
+    assert not other.replay_buffer.rewards[20:].any()
+
+
+def test_a_buffer_that_does_not_say_what_was_done_to_its_rewards_is_taken_as_it_is(tmp_path):
+    model = make(reward_transform="antmaze").preload(ARRAYS).learn(20)
+    save_to_pkl(tmp_path / "older.pkl", model.replay_buffer)
+    other = make().preload(tmp_path / "older.pkl")
+    np.testing.assert_array_equal(other.offline_buffer.rewards[:20], model.replay_buffer.rewards[:20])
+    other.load_replay_buffer(tmp_path / "older.pkl")
+    np.testing.assert_array_equal(other.replay_buffer.rewards, model.replay_buffer.rewards)
+
+
+@pytest.mark.parametrize("value", ["antmaze", ["antmaze", 0.0, 1.0], ["antmaze", 1.0, float("nan")], ["antmaze", 1.0]])
+def test_what_was_done_to_rewards_can_be_undone(value, tmp_path):
+    buffer = make().learn(20).replay_buffer
+    buffer.reward_transform = value
+    save_to_pkl(tmp_path / "buffer.pkl", buffer)
+    for read in (make().preload, make().load_replay_buffer):
+        with pytest.raises(ValueError, match="reward_transform must be a name, a scale other than 0 and a shift, got"):
+            read(tmp_path / "buffer.pkl")
 
 
 def test_a_progress_bar(dataset, capsys):

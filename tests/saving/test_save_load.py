@@ -440,6 +440,21 @@ def test_a_model_loads_without_environment_and_for_another_number_of_environment
 # Loading a replay buffer ------------------------------------------------------------------------------------------------
 
 
+def test_an_environment_may_be_its_id_wherever_it_is_given(saved, tmp_path):
+    loaded = CausalGDP.load(saved / "model", "Pendulum-v1")
+    loaded.set_env("Pendulum-v1")
+    other = CausalGDP.load(saved / "model")
+    other.set_env("Pendulum-v1")
+    for model in (loaded, other):
+        assert model.get_env().get_attr("spec")[0].id == "Pendulum-v1"
+        model.learn(5)
+    path = loaded.save_checkpoint(tmp_path / "there.zip")
+    assert CausalGDP.resume(path, "Pendulum-v1").get_env().get_attr("spec")[0].id == "Pendulum-v1"
+    for read in (lambda env: CausalGDP.load(saved / "model", env), lambda env: CausalGDP.resume(path, env), loaded.set_env):
+        with pytest.raises(gym.error.NameNotFound, match="Pendulums"):
+            read("Pendulums-v1")
+
+
 def transitions_of(buffer):
     """Sorted rows of observation, action, reward, next observation and whether the episode terminated."""
     rows = slice(0, buffer.size())

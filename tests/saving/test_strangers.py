@@ -143,8 +143,13 @@ def test_pickled_tensors_are_not_run(hostile, saved, tmp_path):
     path = changed(saved, tmp_path / "strange.zip", policy__pth=stream.getvalue())
     with pytest.raises(ValueError, match=r"strange.zip"):
         CausalGDP.load(path, device="cpu")
-    with pytest.raises(ValueError, match=r"policy.pth is no file of tensors"):
-        CausalGDP.load(changed(saved, path, policy__pth=pickle.dumps(hostile)), device="cpu")
+    own = CausalGDP("MlpPolicy", "Pendulum-v1", **TINY)
+    with pytest.raises(ValueError, match=r"strange.zip"):
+        own.set_parameters(path)
+    changed(saved, path, policy__pth=pickle.dumps(hostile))
+    for read in (lambda: CausalGDP.load(path, device="cpu"), lambda: own.set_parameters(path)):
+        with pytest.raises(ValueError, match=r"policy.pth is no file of tensors"):
+            read()
 
 
 def test_schedules_of_your_own_need_trust(tmp_path):
@@ -226,6 +231,8 @@ def test_zip_bombs_are_refused_before_they_are_unpacked(saved, tmp_path, monkeyp
     for read in (
         lambda: CausalGDP.load(path),
         lambda: MlpPolicy.load(path),
+        lambda: CausalGDP("MlpPolicy", "Pendulum-v1", **TINY).set_parameters(path),
+        lambda: CausalGDP.resume(path),
         lambda: open_source(path.rename(path.with_suffix(".npz"))),
     ):
         with pytest.raises(ValueError, match=r"bomb.* times as many|bomb.*compressed"):
@@ -238,6 +245,21 @@ def test_damage_that_a_checksum_shows_is_refused(saved, tmp_path):
     (tmp_path / "damaged.zip").write_bytes(data)
     with pytest.raises(ValueError, match=r"damaged.zip cannot be loaded"):
         CausalGDP.load(tmp_path / "damaged.zip", device="cpu")
+    with pytest.raises(ValueError, match=r"damaged.zip cannot be loaded"):
+        CausalGDP("MlpPolicy", "Pendulum-v1", **TINY).set_parameters(tmp_path / "damaged.zip")
+
+
+def test_parameters_that_do_not_fit_are_refused_by_the_name_of_their_file(model, saved, tmp_path):
+    wider = CausalGDP("MlpPolicy", "Pendulum-v1", **{**TINY, "policy_kwargs": {"net_arch": [16]}})
+    without = tmp_path / "without.zip"
+    with zipfile.ZipFile(saved) as archive, zipfile.ZipFile(without, "w") as other:
+        for name in archive.namelist():
+            if name != "actor.optimizer.pth":
+                other.writestr(name, archive.read(name))
+    for one, path in ((wider, saved), (model, without)):
+        with pytest.raises(ValueError, match=f"{path.name} cannot be loaded: ") as error:
+            one.set_parameters(path)
+        assert "\n" not in str(error.value)
 
 
 # Policies, graphs, checkpoints ------------------------------------------------------------------------------------------
@@ -265,22 +287,107 @@ def test_a_graph_names_its_file(tmp_path):
         assert "\n" not in str(error.value)
 
 
-@pytest.mark.parametrize("part", ["model.zip", "state.bin"])
-def test_a_checkpoint_is_not_run(model, saved, tmp_path, hostile, part):
+def strange_checkpoint(model, folder, change=lambda manifest: manifest, **contents):
+    """A checkpoint with other contents, whose checksums are right."""
     from sb3_causalgdp.checkpoints.store import _checksum, _digest
 
-    model.save_checkpoint(tmp_path / "there.zip")
-    strange = changed(saved, tmp_path / "m.zip", data=lambda data: {**data, "something": pickled(hostile)}).read_bytes()
-    content = {"model.zip": strange, "state.bin": pickle.dumps({"generators": hostile})}[part]
+    model.save_checkpoint(folder / "there.zip")
+    contents = {name.replace("__", "."): content for name, content in contents.items()}
 
     def honest(manifest):
-        manifest["files"][part] = _digest(io.BytesIO(content))
+        manifest["files"] |= {name: _digest(io.BytesIO(content)) for name, content in contents.items()}
+        manifest = change(manifest)
         return {**manifest, "checksum": _checksum(manifest)}
 
-    entries = {"manifest__json": honest, part.replace(".", "__"): content}
-    path = changed(tmp_path / "there.zip", tmp_path / "strange.zip", **entries)
+    return changed(folder / "there.zip", folder / "strange.zip", manifest__json=honest, **contents)
+
+
+@pytest.mark.parametrize("part", ["model.zip", "state.bin"])
+def test_a_checkpoint_is_not_run(model, saved, tmp_path, hostile, part):
+    strange = changed(saved, tmp_path / "m.zip", data=lambda data: {**data, "something": pickled(hostile)}).read_bytes()
+    content = {"model.zip": strange, "state.bin": pickle.dumps({"generators": hostile})}[part]
+    path = strange_checkpoint(model, tmp_path, **{part: content})
     with pytest.raises(ValueError, match=r"strange.zip.*trusted=True"):
         CausalGDP.resume(path, gym.make("Pendulum-v1"))
+
+
+def segment(**values):
+    def change(manifest):
+        manifest["buffers"]["online"]["segments"][0].update(values)
+        return manifest
+
+    return change
+
+
+def named(name):
+    return lambda manifest: {**manifest, "files": {**manifest["files"], name: "0" * 64}}
+
+
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        (named("/dev/zero"), "'/dev/zero' is no file of a checkpoint"),
+        (named("../../secret"), "'../../secret' is no file of a checkpoint"),
+        (segment(name="../model.zip"), "is not about 230 rows"),
+        (segment(end=10**12), "is not about 230 rows"),
+        (segment(first=-5), "is not about 230 rows"),
+        (segment(first="many"), "TypeError"),
+        (lambda manifest: {**manifest, "buffers": {"online": {}}}, "KeyError: 'segments'"),
+        (lambda manifest: {name: value for name, value in manifest.items() if name != "run"}, "KeyError: 'run'"),
+    ],
+)
+def test_a_checkpoint_cannot_point_elsewhere(model, tmp_path, change, message):
+    path = strange_checkpoint(model, tmp_path, change)
+    with pytest.raises(ValueError, match=rf"strange.zip.*{message}") as error:
+        CausalGDP.resume(path, gym.make("Pendulum-v1"))
+    assert "\n" not in str(error.value)
+
+
+def test_a_folder_of_checkpoints_with_a_device_in_it_is_refused(model, tmp_path):
+    folder = model.save_checkpoint(tmp_path / "there")
+    (folder / "state.bin").unlink()
+    (folder / "state.bin").symlink_to("/dev/zero")
+    with pytest.raises(ValueError, match=r"state\.bin is no file"):
+        CausalGDP.resume(folder, gym.make("Pendulum-v1"))
+
+
+def state_with(model, folder, **changes):
+    """Of a checkpoint, with other values, by the path of their keys."""
+    from sb3_causalgdp.checkpoints.checkpoint import STATE
+    from sb3_causalgdp.checkpoints.pickles import from_bytes, to_bytes
+    from sb3_causalgdp.checkpoints.store import open_checkpoint
+
+    model.save_checkpoint(folder / "there.zip")
+    with open_checkpoint(folder / "there.zip") as checkpoint, checkpoint.read(STATE) as file:
+        state = from_bytes(file.read(), trusted=True)
+    for keys, value in changes.items():
+        *parents, last = keys.split("__")
+        part = state
+        for key in parents:
+            part = part[key]
+        part[last] = value
+    return to_bytes(state)
+
+
+@pytest.mark.parametrize(
+    "keys, value, message",
+    [
+        ("rest__online__buffer_size", 10**12, "buffer_size is 1e.12, the limit is 20,000,000"),
+        ("rest__online__pos", 10**6, "its position is 1000000"),
+        ("rest__online__full", "yes", "full must be of bool, got str"),
+        ("rest", {}, "KeyError: 'online'"),
+        ("generators", 3, "TypeError"),
+    ],
+)
+def test_a_checkpoint_whose_state_does_not_fit_is_refused(model, tmp_path, keys, value, message):
+    path = strange_checkpoint(model, tmp_path, state__bin=state_with(model, tmp_path, **{keys: value}))
+    with pytest.raises(ValueError, match=rf"strange.zip cannot be resumed: .*{message}"):
+        CausalGDP.resume(path, gym.make("Pendulum-v1"))
+
+
+def test_a_checkpoint_sets_no_other_attributes_of_a_model(model, tmp_path):
+    path = strange_checkpoint(model, tmp_path, state__bin=state_with(model, tmp_path, attributes__gamma=0.5))
+    assert CausalGDP.resume(path, gym.make("Pendulum-v1")).gamma == model.gamma
 
 
 # Transitions ------------------------------------------------------------------------------------------------------------

@@ -68,6 +68,16 @@ def test_enjoy_runs_no_pickle(zoo, run, capsys):
     assert "vecnormalize.pkl cannot be read as VecNormalize" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("name", ["args.yml", "config.yml", "vecnormalize.pkl"])
+def test_enjoy_names_a_file_that_is_cut_off(zoo, run, capsys, name):
+    (run / "config.yml").write_text("normalize: true")
+    (run / name).write_bytes({"vecnormalize.pkl": b"\x80\x04cut"}.get(name, b"{env: Pendulum-v1, algo: [causalgdp"))
+    with pytest.raises(SystemExit):
+        enjoy(zoo)
+    line = capsys.readouterr().err.strip().splitlines()[-1]
+    assert name in line and "cannot be read as" in line
+
+
 def test_enjoy_plays_a_run_that_brings_nothing(zoo, run):
     (run / "config.yml").write_text('{normalize: "dict(norm_obs=False, norm_reward=False)", env_wrapper: null}')
     (run / "config.yml").write_text("env_wrapper: [{gymnasium.wrappers.TimeLimit: {max_episode_steps: 2}}]")

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 
+import numpy as np
 import pytest
 import torch as th
 
@@ -49,6 +50,15 @@ def lengths_of_episodes(folder):
         return [int(row["l"]) for row in csv.DictReader(file)]
 
 
+def cut_all_but_checkpoints(folder):
+    """As a disk does that was full, or another program."""
+    (folder / "Pendulum-v1" / "vecnormalize.pkl").write_bytes(b"\x80\x04cut")
+    for path in [*(folder / "Pendulum-v1").glob("*.yml"), folder / "evaluations.npz"]:
+        path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    with (folder / "0.monitor.csv").open("a") as file:
+        file.write("-300.1,6")
+
+
 def test_the_same_command_goes_on_after_it_was_killed_and_after_it_was_terminated(command, folder):
     run, uninterrupted = folder / "logs/causalgdp/Pendulum-v1_1", folder / "logs/causalgdp/Pendulum-v1_2"
     process = start(command)
@@ -60,8 +70,12 @@ def test_the_same_command_goes_on_after_it_was_killed_and_after_it_was_terminate
     assert "Going on with logs/causalgdp/Pendulum-v1_1" in output
     last_line = errors.strip().splitlines()[-1]
     assert last_line.startswith("Terminated after ") and "go on from logs/causalgdp/Pendulum-v1_1/checkpoints" in last_line
+    cut_all_but_checkpoints(run)
     process = start(command)
-    assert process.communicate() and process.returncode == 0
+    outputs = process.communicate()
+    assert process.returncode == 0, outputs
+    with np.load(run / "evaluations.npz") as evaluations:
+        assert evaluations["timesteps"].tolist() == [130, 260, 390]
     # A run that is complete is not continued
     process = start(command)
     assert process.communicate() and process.returncode == 0

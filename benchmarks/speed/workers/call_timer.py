@@ -36,12 +36,12 @@ PARTS = (
         "firm",
     ),
     Part("TD target", r"td_target|bellman", "firm"),
-    Part("targets", r"polyak|_targets$|soft_update", "firm"),
+    Part("targets", r"polyak|update_averages$|_targets$|soft_update", "firm"),
     Part("denoising and guidance", r"denois\w*_loss|make_guidance|guidance_shift", "firm"),
     Part("Q term", r"Actor\.sample$|samplers\.sample|q_loss|q_term|\.q_values$", "firm"),
-    Part("world model", r"_update_world_model|world_model_loss|\.world_model\.", "firm"),
-    Part("critics", r"_update_critic|critic_loss", "loose"),
-    Part("actor: backward and the rest", r"_update_actor|_actor_loss", "loose"),
+    Part("world model", r"update_world_model|world_model_loss|\.world_model\.", "firm"),
+    Part("critics", r"update_critic|critic_loss", "loose"),
+    Part("actor: backward and the rest", r"update_actor|actor_loss", "loose"),
 )
 
 

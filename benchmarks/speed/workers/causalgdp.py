@@ -89,7 +89,7 @@ class CausalGDPContestant(OffPolicyContestant, TorchContestant):
         start = time.process_time()
         self.update(n)
         middle = time.process_time()
-        with timer.attached(("sb3_causalgdp", "stable_baselines3"), extra, owner=self.model):
+        with timer.attached(("sb3_causalgdp", "stable_baselines3"), extra, owner=self.model._updates):
             timer.wrap(self.update, "update")(n)
         functions = {name: {key: value / n for key, value in asdict(taken).items()} for name, taken in timer.functions.items()}
         parts = {name: seconds / n for name, seconds in timer.seconds.items()}

@@ -1,5 +1,6 @@
-"""Between SB3's observations and the structural model's rows: normalisation, dictionaries, one observation or many."""
+"""What a user asks a model: interventions, effects of actions, counterfactuals, in the environment's own units."""
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -7,10 +8,112 @@ import numpy.typing as npt
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_causalgdp.causal import StructuralModel, TransitionVariables
+from sb3_causalgdp.causal import (
+    ActionEffects,
+    CausalGraph,
+    Counterfactual,
+    InterventionalDistribution,
+    StructuralModel,
+    TransitionVariables,
+)
+from sb3_causalgdp.causal.interventions import ActionRule
+from sb3_causalgdp.offline.algorithm import OfflineToOnlineAlgorithm
 from sb3_causalgdp.policies import CausalGDPPolicy
 
 Observations = np.ndarray | dict[str, np.ndarray]
+
+
+class AskedAlgorithm(OfflineToOnlineAlgorithm):
+    """An algorithm whose policy has a world model and a causal graph that can be asked."""
+
+    policy: CausalGDPPolicy
+    transition_variables: TransitionVariables
+    _causal_graph: CausalGraph | None
+
+    def causal_graph(self) -> CausalGraph:
+        """
+        :return: What causes what, as last discovered; every edge is open before the first discovery
+        """
+        return self._causal_graph or CausalGraph.fully_connected(self.transition_variables)
+
+    def structural_model(self) -> StructuralModel:
+        """
+        The world model as a structural causal model in the environment's own units, on which interventions, effects and
+        counterfactuals are computed.
+
+        With ``VecNormalize``, set its environment first (``set_env``): the model's statistics are read from it.
+
+        :return: The structural model; later training changes its answers
+        :raises RuntimeError: If the world model has not been trained
+        """
+        return make_structural_model(self.policy, self.transition_variables, self._vec_normalize_env)
+
+    def intervene(
+        self,
+        observation: np.ndarray | dict[str, np.ndarray],
+        action: npt.ArrayLike,
+        interventions: Mapping[str, npt.ArrayLike],
+        n_samples: int | None = None,
+    ) -> InterventionalDistribution:
+        """
+        The distribution of the next state and of the reward under do(...), like
+        ``model.intervene(obs, action, {"action[0]": 0.5, "obs[3]'": 1.0})``.
+
+        :param observation: One observation or a batch, as the environment gives it: not normalised by ``VecNormalize``
+        :param action: The action of each, within the bounds of the action space
+        :param interventions: Values by name (see ``model.transition_variables.names``), in the environment's units
+        :param n_samples: Samples of the next state for the reward's uncertainty, None for the delta method
+        :return: See :meth:`~sb3_causalgdp.causal.StructuralModel.intervene`
+        """
+        model = self.structural_model()
+        return model.intervene(self._states_of(observation), actions_of(self.policy, action), interventions, n_samples)
+
+    def effect_of_actions(
+        self,
+        observations: np.ndarray | dict[str, np.ndarray],
+        actions: npt.ArrayLike,
+        delta: npt.ArrayLike | None = None,
+    ) -> ActionEffects:
+        """
+        How strongly each action component moves the reward, direct and through the next state, and each next state variable.
+
+        :param observations: A batch of observations, as the environment gives them: not normalised by ``VecNormalize``
+        :param actions: The action of each, within the bounds of the action space
+        :param delta: Change of the action, in the environment's units; None for the derivative
+        :return: Averages over the observations, see :meth:`~sb3_causalgdp.causal.StructuralModel.effect_of_actions`
+        """
+        model = self.structural_model()
+        return model.effect_of_actions(self._states_of(observations), actions_of(self.policy, actions), delta)
+
+    def counterfactual(
+        self,
+        trajectory: tuple[Any, npt.ArrayLike, npt.ArrayLike],
+        changes: Mapping[str, npt.ArrayLike | ActionRule],
+        follow_policy: bool = False,
+    ) -> Counterfactual:
+        """
+        What would have happened in a recorded episode had other actions been taken, under the same noise, like
+        ``model.counterfactual((observations, actions, rewards), {"action[0]": 0.0})``.
+
+        :param trajectory: T + 1 observations, T actions and T rewards of one episode, as the environment gives them: not
+            normalised by ``VecNormalize``
+        :param changes: For each changed action component a number, T values or a function, see
+            :meth:`~sb3_causalgdp.causal.StructuralModel.counterfactual`
+        :param follow_policy: Whether this model's policy reacts to the counterfactual states with the components that are not
+            changed, its deviation from the recorded actions being replayed; by default they stay as recorded
+        :return: States, actions, rewards and noise, in the environment's units
+        """
+        model = self.structural_model()
+        observations, actions, rewards = trajectory
+        recorded = (self._states_of(observations), actions_of(self.policy, actions), rewards)
+        policy = StatePolicy(self.policy, self._vec_normalize_env) if follow_policy else None
+        return model.counterfactual(recorded, changes, policy)
+
+    def _states_of(self, observation: Any) -> np.ndarray:
+        return states_of(self.policy, observation, self._vec_normalize_env)
+
+
+# Between SB3's observations and the structural model's rows: normalisation, dictionaries, one observation or many --------
 
 
 def make_structural_model(

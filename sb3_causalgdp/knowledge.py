@@ -1,0 +1,133 @@
+"""What a model knows of the causal structure, and which transitions it knows it from."""
+
+import io
+import pathlib
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+import torch as th
+from stable_baselines3.common.buffers import ReplayBuffer
+
+from sb3_causalgdp.causal import CausalGraph, Statistics, TransitionVariables, make_discovery, make_statistics
+from sb3_causalgdp.causal.world_model import MaskedWorldModel
+from sb3_causalgdp.offline.algorithm import OfflineToOnlineAlgorithm
+from sb3_causalgdp.policies import CausalGDPPolicy, DiffusionActor
+from sb3_causalgdp.updates import Updates
+
+SelfAlgorithm = TypeVar("SelfAlgorithm", bound="DiscoveringAlgorithm")
+
+
+class DiscoveringAlgorithm(OfflineToOnlineAlgorithm):
+    """
+    An algorithm that discovers a causal graph from its transitions and writes it into the masks of its world model.
+
+    :param args: As for :class:`~sb3_causalgdp.offline.algorithm.OfflineToOnlineAlgorithm`
+    :param kwargs: As for :class:`~sb3_causalgdp.offline.algorithm.OfflineToOnlineAlgorithm`
+    """
+
+    policy: CausalGDPPolicy
+    actor: DiffusionActor
+    world_model: MaskedWorldModel
+    causal_discovery: str | Callable[..., CausalGraph]
+    causal_discovery_kwargs: dict[str, Any]
+    causal_half_life: float | None
+    causal_window: int | None
+    _updates: Updates
+
+    GRAPHS_IN_HISTORY = 32
+
+    def __init__(self, *args, **kwargs) -> None:
+        super().__init__(*args, **kwargs)
+        # Saved with the model
+        self.causal_statistics: Statistics | None = None
+        self._statistics_made_by: list[Any] | None = None
+        self._causal_graph: CausalGraph | None = None
+        self.causal_graph_history: list[CausalGraph] = []
+        self._steps_since_refresh = 0
+        # Positions of the replay buffer that were ever written, and how many of them the statistics have seen
+        self._stored_position = 0
+        self._fed_position = 0
+        # The same of the preloaded transitions, and which these were
+        self._fed_offline_position = 0
+        self._fed_marks: list[str] = []
+
+    def set_causal_graph(self, graph: CausalGraph) -> None:
+        """
+        Write a causal graph into the masks of the world model and let it steer the sampling. The graphs of up to 32 moments of
+        the training are in ``causal_graph_history``, saved on request: ``save(path, include=["causal_graph_history"])``.
+
+        :param graph: The graph, on this model's variables
+        :raises ValueError: If the graph is about other variables
+        """
+        if graph.variables != self.transition_variables:
+            raise ValueError(
+                f"The graph is about {graph.variables.names}, but this model's variables are {self.transition_variables.names}"
+            )
+        masks = (graph.state_to_state, graph.action_to_state, graph.state_to_reward, graph.action_to_reward)
+        self.world_model.set_masks(*(th.as_tensor(mask, dtype=th.float32, device=self.device) for mask in masks))
+        self.policy.guidance_ready.fill_(1.0)
+        self._causal_graph = graph
+        self.causal_graph_history.append(graph)
+        if len(self.causal_graph_history) > self.GRAPHS_IN_HISTORY:
+            # Every second one goes, so that what is left spans the whole training; the newest stays
+            self.causal_graph_history = self.causal_graph_history[::-2][::-1]
+
+    def _setup_discovery(self) -> None:
+        try:
+            self.discovery = make_discovery(self.causal_discovery, **self.causal_discovery_kwargs)
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"causal_discovery_kwargs: {error}") from error
+        action_names = tuple(f"action[{index}]" for index in range(self.actor.action_dim))
+        self.transition_variables = TransitionVariables(self.policy.state_names(), action_names)
+        method = self.causal_discovery
+        # A callable that was saved is not the same object when it is loaded
+        name = method if isinstance(method, str) else getattr(method, "__qualname__", type(method).__qualname__)
+        forgetting = (self.causal_half_life, self.causal_window)
+        made_by = [name, self.causal_discovery_kwargs, *forgetting]  # a list, as it comes back from the zip
+        if self.causal_statistics is None or self._statistics_made_by != made_by:
+            # Another method, which load() may have brought, gathers anew from the replay buffer
+            self.causal_statistics = self._new_statistics()
+            self._statistics_made_by = made_by
+            self._fed_position = self._fed_offline_position = 0
+            self._fed_marks = []
+
+    def _new_statistics(self) -> Statistics:
+        try:
+            return make_statistics(self.discovery, self.transition_variables, self.causal_half_life, self.causal_window)
+        except ValueError as error:
+            raise ValueError(f"causal_half_life and causal_window: {error}") from error
+
+    # Which transitions the statistics have seen ---------------------------------------------------------------------------
+
+    def _store_transition(self, replay_buffer, buffer_action, new_obs, reward, dones, infos) -> None:
+        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
+        self._stored_position += 1
+
+    def preload(self: SelfAlgorithm, source: Any, *args, **kwargs) -> SelfAlgorithm:
+        first = 0 if self.offline_buffer is None else self.offline_buffer.size()
+        super().preload(source, *args, **kwargs)
+        assert self.offline_buffer is not None
+        self._updates.batches.forget_preloaded()
+        if self._offline_marks[-1] in self._fed_marks and self._fed_offline_position == first:
+            # A loaded model, whose statistics know these rows
+            self._fed_offline_position = self.offline_buffer.size()
+        return self
+
+    def load_replay_buffer(
+        self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True, *, trusted: bool = False
+    ) -> None:
+        super().load_replay_buffer(path, truncate_last_traj, trusted=trusted)
+        assert self.replay_buffer is not None
+        if self.replay_buffer is not self.offline_buffer:
+            # A buffer that was saved later than the model, or by another
+            self._stored_position = max(self._stored_position, self.replay_buffer.size())
+        self._fed_offline_position = 0
+        if self.offline_buffer is not None and all(mark in self._fed_marks for mark in self._offline_marks):
+            self._fed_offline_position = self.offline_buffer.size()
+
+    def _fitting(self, buffer: ReplayBuffer, name: str) -> ReplayBuffer:
+        fitting = super()._fitting(buffer, name)
+        if fitting is not buffer:
+            # The newest rows are no longer at the newest positions: the few that the statistics have not seen are lost to them
+            self._fed_position = self._stored_position
+        return fitting

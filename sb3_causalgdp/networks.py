@@ -1,0 +1,202 @@
+"""Diffusion actor and critics: what a policy is made of, beside the world model."""
+
+from typing import Any
+
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.policies import BasePolicy, ContinuousCritic
+from stable_baselines3.common.preprocessing import get_action_dim
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, create_mlp
+from stable_baselines3.common.type_aliases import PyTorchObs
+from torch import nn
+
+from sb3_causalgdp.acceleration.products import make_layers_fast
+from sb3_causalgdp.diffusion import Guidance, GuidanceRule, MLPDenoiser, NoiseSchedule, sample
+from sb3_causalgdp.diffusion.samplers import bind, check_sampler
+from sb3_causalgdp.saving.policies import PickledAlone
+
+ACTIVATIONS: dict[str, type[nn.Module]] = {
+    "mish": nn.Mish,
+    "silu": nn.SiLU,
+    "relu": nn.ReLU,
+    "tanh": nn.Tanh,
+    "elu": nn.ELU,
+    "gelu": nn.GELU,
+}
+
+
+def activation_class(activation_fn: str | type[nn.Module]) -> type[nn.Module]:
+    """
+    :param activation_fn: Class of the activation, or its name in lower case
+    :return: The class
+    :raises ValueError: If the name is unknown
+    """
+    if not isinstance(activation_fn, str):
+        return activation_fn
+    if activation_fn.lower() not in ACTIVATIONS:
+        raise ValueError(
+            f"Unknown activation_fn {activation_fn!r}: it must be a torch.nn class or one of {sorted(ACTIVATIONS)}"
+        )
+    return ACTIVATIONS[activation_fn.lower()]
+
+
+def q_values(
+    critic: ContinuousCritic, features: th.Tensor, actions: th.Tensor, networks: slice = slice(None)
+) -> list[th.Tensor]:
+    """
+    What each critic network says of features that are known already; the critic itself extracts them anew.
+
+    :param critic: The critics
+    :param features: Shape ``(batch, features_dim)``
+    :param actions: In [-1, 1], shape ``(batch, d)``
+    :param networks: Which of the networks, all by default
+    :return: One tensor of shape ``(batch, 1)`` for each network
+    """
+    inputs = th.cat([features, actions], dim=1)
+    return [network(inputs) for network in critic.q_networks[networks]]
+
+
+class Critic(PickledAlone, ContinuousCritic):
+    """
+    SB3's critics, with layer normalisation between each hidden layer and its activation if asked for.
+
+    :param layer_norm: Whether to normalise the hidden layers
+    :param kwargs: Keyword arguments of SB3's critics
+    """
+
+    def __init__(self, layer_norm: bool = False, **kwargs: Any) -> None:
+        super().__init__(**kwargs)
+        n_inputs = kwargs["features_dim"] + get_action_dim(kwargs["action_space"])
+        for index, network in enumerate(self.q_networks):
+            if layer_norm:
+                norms: list[type[nn.Module]] = [nn.LayerNorm]
+                layers = create_mlp(n_inputs, 1, kwargs["net_arch"], kwargs["activation_fn"], post_linear_modules=norms)
+                self.q_networks[index] = network = nn.Sequential(*layers)
+                setattr(self, f"qf{index}", network)
+            make_layers_fast(network)
+
+
+class DiffusionActor(PickledAlone, BasePolicy):
+    """
+    Diffusion policy: denoises actions, conditioned on the features of the observation.
+
+    :param observation_space: Observation space
+    :param action_space: Action space
+    :param net_arch: Hidden layers of the denoiser
+    :param features_extractor: Network that turns observations into features
+    :param features_dim: Number of features
+    :param activation_fn: Activation class
+    :param normalize_images: Whether to divide images by 255
+    :param diffusion_steps: Number of diffusion steps K
+    :param noise_schedule: ``vp``, ``linear`` or ``cosine``
+    :param sampler: ``ddpm`` or ``ddim``
+    :param ddim_eta: Noise of DDIM, in [0, 1]
+    """
+
+    # Noise's share of the variance from which an action is adapted to a state near by
+    ADAPTING_NOISE = 0.1
+
+    def __init__(
+        self,
+        observation_space: spaces.Space,
+        action_space: spaces.Box,
+        net_arch: list[int],
+        features_extractor: BaseFeaturesExtractor,
+        features_dim: int,
+        activation_fn: type[nn.Module] = nn.Mish,
+        normalize_images: bool = True,
+        diffusion_steps: int = 5,
+        noise_schedule: str = "vp",
+        sampler: str = "ddpm",
+        ddim_eta: float = 0.0,
+    ) -> None:
+        super().__init__(
+            observation_space,
+            action_space,
+            features_extractor=features_extractor,
+            normalize_images=normalize_images,
+            squash_output=True,
+        )
+        check_sampler(sampler, ddim_eta)
+        self.action_dim = get_action_dim(action_space)
+        self.net_arch = net_arch
+        self.features_dim = features_dim
+        self.activation_fn = activation_fn
+        self.sampler = sampler
+        self.ddim_eta = ddim_eta
+        self.schedule = NoiseSchedule(noise_schedule, diffusion_steps)
+        noisy_enough = (i for i, signal in enumerate(self.schedule.alpha_bar_list) if 1.0 - signal >= self.ADAPTING_NOISE)
+        self.adapting_step = next(noisy_enough, self.schedule.n_steps - 1)
+        self.denoiser = MLPDenoiser(self.action_dim, features_dim, diffusion_steps, net_arch, activation_fn)
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        data = super()._get_constructor_parameters()
+        data.update(
+            net_arch=self.net_arch,
+            features_dim=self.features_dim,
+            activation_fn=self.activation_fn,
+            features_extractor=self.features_extractor,
+            diffusion_steps=self.schedule.n_steps,
+            noise_schedule=self.schedule.name,
+            sampler=self.sampler,
+            ddim_eta=self.ddim_eta,
+        )
+        return data
+
+    def features(self, observation: PyTorchObs) -> th.Tensor:
+        """
+        :param observation: Observations as SB3 gives them to policies
+        :return: What the denoiser is conditioned on, shape ``(batch, features_dim)``
+        """
+        return self.extract_features(observation, self.features_extractor)
+
+    def sample(
+        self,
+        features: th.Tensor,
+        noise: th.Tensor | None = None,
+        guidance: Guidance | None = None,
+        rule: GuidanceRule | None = None,
+        divergences: list[th.Tensor] | None = None,
+    ) -> th.Tensor:
+        """
+        Denoise actions, see :func:`sb3_causalgdp.diffusion.sample`.
+
+        :param features: Shape ``(batch, features_dim)``
+        :param noise: Shape ``(K, batch, d)``, drawn if None
+        :param guidance: Causal guidance, None for none
+        :param rule: How the guidance enters a step
+        :param divergences: If a list, each guided step appends its KL divergence
+        :return: Actions in [-1, 1], shape ``(batch, d)``
+        """
+        return sample(
+            self.denoiser,
+            self.schedule,
+            features,
+            guidance,
+            rule,
+            noise=noise,
+            sampler=self.sampler,
+            eta=self.ddim_eta,
+            divergences=divergences,
+        )
+
+    def adapt(self, features: th.Tensor, action: th.Tensor) -> th.Tensor:
+        """
+        Turn an action for one state into one for a state near by: the clean estimate at the diffusion step where little noise
+        is left, from the action as it is there without noise.
+
+        :param features: Of the state near by, shape ``(batch, features_dim)``
+        :param action: Shape ``(batch, d)``
+        :return: Actions in [-1, 1], shape ``(batch, d)``
+        """
+        step = th.full((len(action),), self.adapting_step, device=action.device)
+        noisy = self.schedule.add_noise(action, th.zeros_like(action), step)
+        return self.schedule.clean_estimate(noisy, bind(self.denoiser, features)(noisy, step), step).clamp(-1.0, 1.0)
+
+    def forward(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
+        features = self.features(observation)
+        shape = (self.schedule.n_steps, len(features), self.action_dim)
+        return self.sample(features, th.zeros(shape, device=features.device) if deterministic else None)
+
+    def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
+        return self(observation, deterministic)

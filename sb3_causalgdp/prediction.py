@@ -1,0 +1,128 @@
+"""How a policy acts: on the best of several candidates, steered once more; in numpy where that is faster."""
+
+from typing import Any
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.type_aliases import PyTorchObs
+
+from sb3_causalgdp.acceleration.acting import NumpyActing
+from sb3_causalgdp.checks import first_not_finite_index, fits_float32
+from sb3_causalgdp.networks import q_values
+
+Policy = Any  # a CausalGDPPolicy, whose file imports this one
+
+
+def act(policy: Policy, observation: PyTorchObs, deterministic: bool) -> th.Tensor:
+    """
+    :param policy: The policy
+    :param observation: Observations as SB3 gives them to policies
+    :param deterministic: Whether the candidates' noise is the same at every call
+    :return: Actions in [-1, 1], without exploration noise, shape ``(batch, d)``
+    """
+    acting = _numpy_acting(policy, observation)
+    if acting is not None:
+        assert isinstance(observation, th.Tensor)
+        noise = candidate_noise(policy, len(observation), deterministic).cpu().numpy()
+        actions = acting(policy, observation.float().flatten(1).cpu().numpy(), noise, policy.is_guided)
+        return th.as_tensor(actions, device=observation.device)
+    with th.no_grad():
+        features = policy.actor.features(observation)
+        return act_in_torch(policy, observation, features, candidate_noise(policy, len(features), deterministic))
+
+
+def _numpy_acting(policy: Policy, observation: PyTorchObs) -> NumpyActing | None:
+    """The fast path for few rows, where it covers this policy; made anew when the networks were moved or replaced."""
+    if policy.training or not isinstance(observation, th.Tensor):
+        return None
+    if len(observation) * policy.n_action_candidates > NumpyActing.MOST_ROWS:
+        return None
+    if policy._acting is not None and not policy._acting.is_current(policy):
+        policy._acting = None
+    if policy._acting is None and NumpyActing.covers(policy):
+        policy._acting = NumpyActing(policy)
+    return policy._acting
+
+
+def act_in_torch(policy: Policy, observation: PyTorchObs, features: th.Tensor, noise: th.Tensor) -> th.Tensor:
+    """
+    :param policy: The policy
+    :param observation: Observations as SB3 gives them to policies
+    :param features: The actor's features of these
+    :param noise: Of the candidates, see :func:`candidate_noise`
+    :return: Actions in [-1, 1], shape ``(batch, d)``
+    """
+    critic_features = policy.critic_target.extract_features(observation, policy.critic_target.features_extractor)
+    candidates = policy.actor.sample(features.repeat_interleave(policy.n_action_candidates, dim=0), noise)
+    best = _best_candidate(policy, critic_features, candidates)
+    action = candidates[best]
+    if not policy.is_guided:
+        return action
+    # From the same noise, the guided chain ends at the best candidate, moved by the guidance
+    guidance = policy.acting_guidance(policy.causal_state(observation), action)
+    return policy.actor.sample(features, noise[:, best], guidance, policy.guidance_rule)
+
+
+def fixed_noise(n_steps: int, n_candidates: int, action_dim: int) -> th.Tensor:
+    """
+    Noise of deterministic predictions.
+
+    :param n_steps: Number of diffusion steps K
+    :param n_candidates: Number of candidates N
+    :param action_dim: Size of an action
+    :return: None for the first candidate, the same at every call for the others, shape ``(K, N, d)``
+    """
+    noise = th.randn((n_steps, n_candidates, action_dim), generator=th.Generator().manual_seed(0))
+    noise[:, 0] = 0.0
+    return noise
+
+
+def candidate_noise(policy: Policy, n_observations: int, deterministic: bool) -> th.Tensor:
+    """
+    :param policy: The policy
+    :param n_observations: Number of observations
+    :param deterministic: Whether it is the same at every call
+    :return: Noise of each observation's candidates, shape ``(K, n_observations * N, d)``
+    """
+    fixed = policy.candidate_noise
+    if deterministic:
+        return fixed if n_observations == 1 else fixed.repeat(1, n_observations, 1)
+    n_steps, n_candidates, action_dim = fixed.shape
+    return th.randn(n_steps, n_observations * n_candidates, action_dim, device=fixed.device)
+
+
+def _best_candidate(policy: Policy, critic_features: th.Tensor, actions: th.Tensor) -> th.Tensor:
+    """Row of the candidate with the largest of the smallest target Q, for each observation."""
+    n_candidates = policy.n_action_candidates
+    first = th.arange(0, len(actions), n_candidates, device=actions.device)
+    if n_candidates == 1:
+        return first
+    repeated = critic_features.repeat_interleave(n_candidates, dim=0)
+    values = th.cat(q_values(policy.critic_target, repeated, actions), dim=1).amin(dim=1)
+    return first + values.view(-1, n_candidates).argmax(dim=1)
+
+
+def check_observation(observation: Any, space: spaces.Space) -> None:
+    """
+    :param observation: What a user gives ``predict``
+    :param space: The observation space
+    :raises ValueError: If it is NaN or infinite in float32, with its row and index
+    """
+    if isinstance(observation, np.ndarray):
+        if not fits_float32(observation):
+            _refuse(observation, space)
+        return
+    for key, values in observation.items() if isinstance(observation, dict) else ((None, observation),):
+        if isinstance(values, (list, np.ndarray)) and not fits_float32(np.asarray(values)):
+            _refuse(np.asarray(values), space, key)
+
+
+def _refuse(values: np.ndarray, space: spaces.Space, key: str | None = None) -> None:
+    own_space = space if key is None else space[key]  # type: ignore[index]
+    index = first_not_finite_index(values)
+    value = np.atleast_1d(values)[index]
+    n_axes = len(own_space.shape or ())
+    row = f"row {index[0]}, " if values.ndim > n_axes else ""
+    name = "The observation" if key is None else f"observation[{key!r}]"
+    raise ValueError(f"{name} is {value} at {row}index {list(index[len(index) - n_axes :])}: it must be finite in float32")

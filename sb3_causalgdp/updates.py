@@ -1,0 +1,332 @@
+"""One gradient step: which networks it trains, on what, and by which of the losses."""
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.buffers import NStepReplayBuffer
+from stable_baselines3.common.utils import get_parameters_by_name, polyak_update
+
+from sb3_causalgdp.acceleration.fast_steps import FastSteps, n_threads_at_most
+from sb3_causalgdp.acceleration.gradients import Gradients, gradients_of
+from sb3_causalgdp.batches import Batches
+from sb3_causalgdp.causal.world_model import moves
+from sb3_causalgdp.losses import DenoisingTerms, critic_loss, denoising_loss, q_loss, quantile, td_target, world_model_loss
+from sb3_causalgdp.networks import q_values
+from sb3_causalgdp.offline.replay import rows_of
+
+Model = Any  # a CausalGDP, whose file imports this one
+Losses = dict[str, th.Tensor]
+
+
+class StepPlan(NamedTuple):
+    """What one gradient step does beside updating the critics."""
+
+    trains_world_model: bool
+    trains_actor: bool
+    guided: bool
+    """Whether the denoising term is steered."""
+    climbed: int
+    """The critic whose value the actor climbs."""
+    running_weight: float
+    """Share of the batch's statistics that enters the running ones."""
+
+    @property
+    def trains_others(self) -> bool:
+        """Whether it trains more than the critics."""
+        return self.trains_world_model or self.trains_actor
+
+
+class StepBatch(NamedTuple):
+    """What one gradient step learns from."""
+
+    replay_data: Any
+    """Of the critics: a sample of a replay buffer."""
+    target: th.Tensor
+    """TD target of these rows, shape ``(batch, 1)``."""
+    transitions: Any
+    """Of the world model and the actor: the same sample, or one of single steps where returns are of several."""
+    next_actions: th.Tensor | None
+    """Of the actor's moving average after the transitions, shape ``(batch, d)``; None if they are not known yet."""
+
+
+class Updates:
+    """
+    The updates of a model's networks: each computes its loss and the gradients, and makes the optimizer's step. What is
+    compiled or recorded of them is known here and in ``acceleration/`` alone.
+
+    :param model: The model, a ``CausalGDP``; its arguments are looked up anew in each step, so that they may change
+    """
+
+    # Share of a batch's statistic that enters the running reward quantile and the running standard deviation of Q
+    RUNNING_WEIGHT = 0.01
+    REWARD_QUANTILE = 0.99
+    N_BACKUP_ACTIONS = 10
+    COMPILED = ("td_target", "critic_gradients", "world_model_gradients", "actor_gradients")
+
+    def __init__(self, model: Model) -> None:
+        policy = model.policy
+        self.model, self.policy, self.world_model = model, policy, policy.world_model
+        self.actor, self.critic = policy.actor, policy.critic
+        self.actor_target, self.critic_target = policy.actor_target, policy.critic_target
+        self.batches = Batches(model)
+        networks = (self.actor, self.actor_target, self.critic, self.critic_target, self.world_model)
+        # Once, because to visit all modules takes a hundredth of a gradient step
+        self._parameters: dict[th.nn.Module, list[th.Tensor]] = {network: [*network.parameters()] for network in networks}
+        # Running mean and running var
+        self._batch_norm_stats, self._batch_norm_stats_target = (
+            [statistic for network in pair for statistic in get_parameters_by_name(network, ["running_"])]
+            for pair in ((self.critic, self.actor), (self.critic_target, self.actor_target))
+        )
+        self.fast = FastSteps(self.optimizers(), model.compile, model.cuda_graph, model.device)
+        for name in self.COMPILED:
+            setattr(self, name, self.fast.compiled(getattr(self, name)))
+
+    def optimizers(self) -> list[th.optim.Optimizer]:
+        """
+        :return: Those of the actor, the critics and the world model
+        """
+        return [optimizer_of(module) for module in (self.actor, self.critic, self.world_model)]
+
+    # Which steps, and on what ---------------------------------------------------------------------------------------------
+
+    @contextmanager
+    def made_fast(self, gradient_steps: Callable[..., Losses]) -> Iterator[Callable[..., Losses]]:
+        """
+        :param gradient_steps: Makes the steps of some plans, on the batches that :meth:`planned` gives with them
+        :return: Does the same, within this context, in less time; what it returns is overwritten by the next call
+        """
+        model = self.model
+        # All that the steps depend on and that may change while it trains
+        weights = (model.eta, model.denoising_weight, model.bound_penalty, model.q_scale)
+        rates = (model.tau, model.gamma, model.max_grad_norm)
+        scales = (self.policy.state_guidance_scale, self.policy.outcome_guidance_scale)
+        with n_threads_at_most(model.torch_threads, self.policy.has_image_state):
+            yield self.fast.made_fast(gradient_steps, (weights, rates, scales))
+
+    def planned(self, gradient_steps: int, batch_size: int) -> Iterator[tuple[tuple[StepPlan, ...], list[Any]]]:
+        """
+        :param gradient_steps: How many are to be made
+        :param batch_size: Transitions for each
+        :return: The plans of those from one update of the actor to the next, and their batches: the critics', one behind the
+            other, and, where returns are of several steps, one of single steps for each plan that trains more than these
+        """
+        guided = self.policy.is_guided  # once, because a GPU has to be waited for
+        for n_steps, replay_data in self.batches.up_to_actor_updates(gradient_steps, batch_size):
+            plans = tuple(self._next_plan(guided) for _ in range(n_steps))
+            batches = [replay_data]
+            if isinstance(self.model.replay_buffer, NStepReplayBuffer):
+                batches += [self.batches.sample(batch_size, one_step=True) for plan in plans if plan.trains_others]
+            yield plans, batches
+
+    def _next_plan(self, guided: bool) -> StepPlan:
+        model = self.model
+        model._n_updates += 1
+        trains_actor = model._n_updates % model.policy_delay == 0
+        return StepPlan(
+            trains_world_model=model._n_updates % model.world_model_delay == 0,
+            trains_actor=trains_actor,
+            guided=guided,
+            climbed=int(np.random.randint(len(self.critic.q_networks))) if trains_actor else 0,
+            # The first batches are averaged, so that the start value is forgotten at once
+            running_weight=max(1.0 / model._n_updates, self.RUNNING_WEIGHT),
+        )
+
+    @staticmethod
+    def dealt(
+        plans: Sequence[StepPlan], replay_data: Any, one_step: Sequence[Any], next_actions: th.Tensor, target: th.Tensor
+    ) -> Iterator[tuple[StepPlan, StepBatch]]:
+        """
+        :param plans: Of some gradient steps
+        :param replay_data: Batches of the critics, one behind the other
+        :param one_step: A batch for each step that trains more than the critics, none if ``replay_data`` is for all
+        :param next_actions: After ``replay_data``
+        :param target: TD target of ``replay_data``
+        :return: Each plan with its batch
+        """
+        batch_size, of_others = len(target) // len(plans), iter(one_step)
+        for index, plan in enumerate(plans):
+            rows = slice(index * batch_size, (index + 1) * batch_size)
+            own = rows_of(replay_data, rows)
+            single = next(of_others, None) if plan.trains_others else None
+            others = (own, next_actions[rows]) if single is None else (single, None)
+            yield plan, StepBatch(own, target[rows], *others)
+
+    def beside_critics(self) -> Callable[[], AbstractContextManager[None]]:
+        """
+        :return: Makes contexts, for what knows nothing of the updates of the critics that are launched from here on
+        """
+        return self.fast.branch()
+
+    # Critics --------------------------------------------------------------------------------------------------------------
+
+    def td_target(self, replay_data) -> tuple[th.Tensor, th.Tensor]:
+        """
+        :param replay_data: Sample of a replay buffer
+        :return: Actions in the next states, from the chain of the actor's moving average, shape ``(batch, d)``; and the TD
+            target with them, shape ``(batch, 1)``
+        """
+        # For n-step replay, discount factor is gamma**n_steps (when no early termination)
+        discounts = replay_data.discounts if replay_data.discounts is not None else self.model.gamma
+        n_actions = self.N_BACKUP_ACTIONS if self.model.max_q_backup else 1
+        next_observations = replay_data.next_observations
+        with th.no_grad():
+            actor_features = self.actor_target.features(next_observations).repeat_interleave(n_actions, dim=0)
+            next_actions = self.actor_target.sample(actor_features)
+            critic_features = self.critic_target.extract_features(next_observations, self.critic_target.features_extractor)
+            next_q_values = q_values(self.critic_target, critic_features.repeat_interleave(n_actions, dim=0), next_actions)
+            target = td_target(next_q_values, replay_data.rewards, replay_data.dones, discounts, n_actions)
+        return next_actions[::n_actions], target
+
+    def update_critics(self, replay_data, target: th.Tensor, running_weight: float) -> Losses:
+        """
+        :param replay_data: Sample of a replay buffer
+        :param target: TD target, shape ``(batch, 1)``
+        :param running_weight: Share of the target's standard deviation that enters the running one
+        :return: The loss
+        """
+        target_std, loss, gradients = self.critic_gradients(replay_data, target)
+        self.step(self.critic, gradients)
+        with th.no_grad():
+            self.policy.return_std.lerp_(target_std, running_weight)
+        return {"critic_loss": loss}
+
+    def critic_gradients(self, replay_data, target: th.Tensor) -> tuple[th.Tensor, th.Tensor, Gradients]:
+        target_std, target_mean = th.std_mean(target, correction=0)
+        target_std = th.where(moves(target_std, target_mean), target_std, 1.0)
+        loss = critic_loss(self.critic(replay_data.observations, replay_data.actions), target)
+        return target_std, loss.detach(), gradients_of(self.critic, loss)
+
+    # World model ----------------------------------------------------------------------------------------------------------
+
+    def update_world_model(self, transitions, running_weight: float) -> Losses:
+        """
+        :param transitions: Sample of single steps
+        :param running_weight: Share of the rewards' quantile that enters the running one
+        :return: The losses
+        """
+        state = self.policy.causal_state(transitions.observations)
+        next_state = self.policy.causal_state(transitions.next_observations)
+        rewards = transitions.rewards.flatten()
+        with th.no_grad():
+            self.policy.reward_target.lerp_(quantile(rewards, self.REWARD_QUANTILE), running_weight)
+        # The memory efficient buffer does not keep the last observation of an episode
+        known = 1.0 - transitions.dones.flatten() if self.model.optimize_memory_usage else None
+        transition, reward, gradients = self.world_model_gradients(state, transitions.actions, next_state, rewards, known)
+        self.step(self.world_model, gradients)
+        return {"world_model_transition_loss": transition, "world_model_reward_loss": reward}
+
+    def world_model_gradients(
+        self, state: th.Tensor, action: th.Tensor, next_state: th.Tensor, rewards: th.Tensor, known: th.Tensor | None
+    ) -> tuple[th.Tensor, th.Tensor, Gradients]:
+        world_model, sample_masks = self.world_model, self.model.sample_masks
+        world_model.update_statistics(state, next_state, rewards, known)
+        transition, reward = world_model_loss(world_model, state, action, next_state, rewards, known, sample_masks)
+        return transition.detach(), reward.detach(), gradients_of(world_model, transition + reward)
+
+    # Actor ----------------------------------------------------------------------------------------------------------------
+
+    def update_actor(self, transitions, next_actions: th.Tensor | None, plan: StepPlan) -> Losses:
+        """
+        :param transitions: Sample of single steps
+        :param next_actions: After them, for the guidance's return target, shape ``(batch, d)``; None to sample them
+        :param plan: Says which critic is climbed, and whether the denoising term is steered
+        :return: The losses
+        """
+        if next_actions is None:
+            with th.no_grad():
+                next_actions = self.actor_target.sample(self.actor_target.features(transitions.next_observations))
+        losses, gradients = self.actor_gradients(transitions, next_actions, plan.climbed, plan.guided)
+        self.step(self.actor, gradients)
+        return losses
+
+    def actor_gradients(self, transitions, next_actions: th.Tensor, climbed: int, guided: bool) -> tuple[Losses, Gradients]:
+        denoising, q_term = self.actor_losses(transitions, next_actions, climbed, guided)
+        model = self.model
+        loss = model.denoising_weight * denoising.loss + model.eta * q_term + model.bound_penalty * denoising.outside
+        losses = {"actor_loss": loss, "denoising_loss": denoising.loss, "q_loss": q_term, "bound_loss": denoising.outside}
+        return {name: value.detach() for name, value in losses.items()}, gradients_of(self.actor, loss)
+
+    def actor_losses(
+        self, transitions, next_actions: th.Tensor, climbed: int, guided: bool
+    ) -> tuple[DenoisingTerms, th.Tensor]:
+        """
+        :param transitions: Sample of single steps
+        :param next_actions: After them
+        :param climbed: Index of the critic that is climbed
+        :param guided: Whether the denoising term is steered
+        :return: The denoising terms and the Q term
+        """
+        observations = transitions.observations
+        features = self.actor.features(observations)
+        guidance = rule = None
+        if guided:
+            rule = self.policy.guidance_rule
+            state, next_state = self.policy.causal_state(observations), self.policy.causal_state(transitions.next_observations)
+            if self.model.optimize_memory_usage:
+                # In place of an episode's last observation, which this buffer does not keep
+                with th.no_grad():
+                    predicted, _ = self.world_model.predict_next_state(state, transitions.actions)
+                next_state = th.where(transitions.dones > 0.0, predicted, next_state)
+            guidance = self.policy.make_guidance(state, next_state, next_actions, climbed)
+        denoising = denoising_loss(self.actor.denoiser, self.actor.schedule, features, transitions.actions, guidance, rule)
+        actions = denoising.clean_actions if self.model.actor_update == "one_step" else self.actor.sample(features)
+        return denoising, self.q_term(observations, actions, transitions.actions, climbed)
+
+    def q_term(self, observations, actions: th.Tensor, of_data: th.Tensor, climbed: int) -> th.Tensor:
+        """
+        :param observations: Of the batch
+        :param actions: The actor's, shape ``(batch, d)``
+        :param of_data: The batch's own, shape ``(batch, d)``
+        :param climbed: Index of the critic that is climbed; the next one sets the scale
+        :return: What the actor minimises of it
+        """
+        other = (climbed + 1) % len(self.critic.q_networks)
+        climbed_network, other_network = slice(climbed, climbed + 1), slice(other, other + 1)
+        replayed = None
+        with th.no_grad():
+            features = self.critic.extract_features(observations, self.critic.features_extractor)
+            (others,) = q_values(self.critic, features, actions, other_network)
+            if self.model.q_scale == "advantage":
+                (replayed,) = q_values(self.critic, features, of_data, other_network)
+        (values,) = q_values(self.critic, features, actions, climbed_network)
+        return q_loss(values, others, replayed)
+
+    # Optimizers and averages ----------------------------------------------------------------------------------------------
+
+    def step(self, module: th.nn.Module, gradients: Gradients) -> None:
+        """
+        :param module: The actor, the critics or the world model
+        :param gradients: By its parameters
+        """
+        parameters = self._parameters[module]
+        for parameter, gradient in zip(parameters, gradients, strict=True):
+            parameter.grad = gradient
+        if self.model.max_grad_norm is not None and module is not self.world_model:
+            th.nn.utils.clip_grad_norm_(parameters, self.model.max_grad_norm)
+        optimizer_of(module).step()
+        for parameter in parameters:
+            # A CUDA graph may write over what it returned
+            parameter.grad = None
+
+    @th.no_grad()
+    def update_averages(self) -> None:
+        """Let the target critics, and the actor's moving average, follow."""
+        # All parameters in one call, as SB3's polyak_update does one by one
+        online = self._parameters[self.critic] + self._parameters[self.actor]
+        targets = self._parameters[self.critic_target] + self._parameters[self.actor_target]
+        th._foreach_lerp_(targets, online, self.model.tau)
+        # Copy running stats, see SB3's GH issue #996
+        polyak_update(self._batch_norm_stats, self._batch_norm_stats_target, 1.0)
+
+
+def optimizer_of(module: th.nn.Module) -> th.optim.Optimizer:
+    """
+    :param module: The actor, the critics or the world model
+    :return: Its optimizer
+    """
+    optimizer = module.optimizer
+    assert isinstance(optimizer, th.optim.Optimizer)
+    return optimizer
