@@ -298,9 +298,12 @@ def test_dictionaries_are_flattened_for_an_mlp(arrays):
     assert CausalGDP.from_dataset(source, "MultiInputPolicy", **KWARGS).preload(source).observation_space == space
 
 
-def test_arrays_do_not_tell_their_spaces(arrays):
-    with pytest.raises(ValueError, match="does not tell its spaces"):
-        CausalGDP.from_dataset(arrays)
+def test_a_source_that_is_no_array_has_to_tell_its_spaces(arrays):
+    class Silent(Source):
+        pass
+
+    with pytest.raises(ValueError, match="it does not tell its spaces: give observation_space= and action_space="):
+        CausalGDP.from_dataset(Silent("it", 5))
 
 
 def test_nothing_to_train_on():

@@ -9,6 +9,7 @@ import argparse
 import io
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -292,16 +293,71 @@ HALF_CHEETAH = TransitionVariables(
 )
 
 
+def mujoco_variables(env_id: str) -> TransitionVariables:
+    """Names from the simulator's joints and bodies, in the order of the observations of Gymnasium's Ant and Humanoid."""
+    env: Any = gym.make(env_id).unwrapped
+    model, structure = env.model, env.observation_structure
+    bodies = [model.body(i).name or f"link {i}" for i in range(1, model.nbody)]
+    joints = [model.joint(i).name for i in range(1, model.njnt)]
+    positions = [*(f"root {name}" for name in ("x", "y", "z", "qw", "qx", "qy", "qz")), *joints]
+    names = [
+        *positions[structure["skipped_qpos"] :],
+        *(f"vel root {name}" for name in ("x", "y", "z", "rx", "ry", "rz")),
+        *(f"vel {joint}" for joint in joints),
+        *(f"cinert {body}[{i}]" for body in bodies for i in range(10) if structure.get("cinert", 0)),
+        *(f"cvel {body}[{i}]" for body in bodies for i in range(6) if structure.get("cvel", 0)),
+        *(f"force {joint}" for joint in joints if structure.get("qfrc_actuator", 0)),
+        *(f"cfrc_ext {body}[{i}]" for body in bodies for i in range(6)),
+    ]
+    actions = tuple(f"torque {model.joint(joint).name}" for joint in model.actuator_trnid[:, 0])
+    return TransitionVariables(tuple(names), actions)
+
+
+def graph_of(env_id: str, variables: TransitionVariables, n_rows: int = 5_000) -> CausalGraph:
+    return discover("partial_r2", variables.stack(*random_transitions(env_id, n_rows)), variables)
+
+
+def plant_graph() -> CausalGraph:
+    """A table of 300 columns: eight machines with 35 sensors each, 20 settings, every third sensor moved by one of them."""
+    rng = np.random.default_rng(0)
+    machines, kinds = ("tank", "pump", "valve", "boiler", "mixer", "column", "heater", "line"), ("level", "flow", "heat")
+    sensors = [f"{machine} {kinds[i % 3]} {i // 3}" for machine in machines for i in range(35)]
+    settings = [f"set {machine} {i}" for machine in machines[:5] for i in range(4)]
+    state, rows = np.zeros(280), []
+    for _ in range(4_000):
+        setting = rng.uniform(-1.0, 1.0, 20)
+        following = 0.7 * state + 0.3 * rng.normal(size=280)
+        following[::3] += 0.8 * setting[np.arange(94) * 20 // 94]
+        following[35:] += 0.3 * state[:-35] * (np.arange(245) % 5 == 0)
+        rows.append(np.concatenate([state, setting, [following[0] - following[140] + following[245]]]))
+        state = following
+    columns = dict(zip([*sensors, *settings, "yield"], np.array(rows).T, strict=True))
+    return discover(columns, states=sensors, actions=settings, reward="yield")
+
+
 def draw_pendulum_graph() -> Figure:
-    graph = discover("partial_r2", PENDULUM.stack(*random_transitions("Pendulum-v1", 10_000)), PENDULUM)
-    return graph.plot()
+    return graph_of("Pendulum-v1", PENDULUM, 10_000).plot()
+
+
+def draw_halfcheetah_graph() -> Figure:
+    return graph_of("HalfCheetah-v5", HALF_CHEETAH).plot()
+
+
+def draw_ant_graph() -> Figure:
+    return graph_of("Ant-v5", mujoco_variables("Ant-v5")).plot()
+
+
+def draw_humanoid_graph() -> Figure:
+    return graph_of("Humanoid-v5", mujoco_variables("Humanoid-v5")).plot(kind="graph")
+
+
+def draw_table_graph() -> Figure:
+    return plant_graph().plot()
 
 
 def draw_halfcheetah_effects() -> Figure:
-    rows = HALF_CHEETAH.stack(*random_transitions("HalfCheetah-v5", 20_000))
-    graph: CausalGraph = discover("partial_r2", rows, HALF_CHEETAH)
     figure = new_figure(8.6, 6.4)
-    plot_heat_map(graph, figure.add_subplot(), values="effects")
+    plot_heat_map(graph_of("HalfCheetah-v5", HALF_CHEETAH, 20_000), figure.add_subplot())
     return figure
 
 
@@ -388,6 +444,10 @@ FIGURES: dict[str, Callable[[], Figure]] = {
     "noise_schedules": draw_noise_schedules,
     "pendulum_graph": draw_pendulum_graph,
     "halfcheetah_effects": draw_halfcheetah_effects,
+    "halfcheetah_graph": draw_halfcheetah_graph,
+    "ant_graph": draw_ant_graph,
+    "humanoid_graph": draw_humanoid_graph,
+    "table_graph": draw_table_graph,
     "counterfactual": draw_counterfactual,
 }
 

@@ -2,7 +2,7 @@
 
 import os
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -16,9 +16,10 @@ from stable_baselines3.common.type_aliases import PyTorchObs
 
 from sb3_causalgdp.callbacks.diagnostics import step_divergences
 from sb3_causalgdp.causal.graph import PLOTS_HINT
-from sb3_causalgdp.causal.plots import plot_causal_graph
-from sb3_causalgdp.causal.plots.effects import plot_action_effects
-from sb3_causalgdp.causal.plots.figures import FONT_SIZE, save_figure
+from sb3_causalgdp.causal.plots import View, plot_action_effects, plot_causal_graph
+from sb3_causalgdp.causal.plots.figures import FONT_SIZE, check_choice, save_figure
+from sb3_causalgdp.causal.plots.graphs import KINDS
+from sb3_causalgdp.causal.plots.view import view_of
 from sb3_causalgdp.causalgdp import CausalGDP
 from sb3_causalgdp.policies import CausalGDPPolicy
 
@@ -36,7 +37,7 @@ class CausalPicturesCallback(BaseCallback):
     """
     Every ``save_freq`` steps, once a causal graph is known, draw
 
-    - ``graph``: the heat map of the masks, with the signs of the effects;
+    - ``graph``: the heat map of the effects, or what ``view`` and ``kind`` say;
     - ``effects``: how strongly each action component moves the reward and the next state, on transitions of the replay buffer,
       once the world model has been trained;
     - ``guidance``: how strongly each step of the denoising chain is moved, where the policy is guided.
@@ -49,13 +50,21 @@ class CausalPicturesCallback(BaseCallback):
         ``pretrain()``; None writes none
     :param batch_size: Transitions on which effects and guidance are computed
     :param verbose: Verbosity level: 1 says when pictures were drawn
-    :raises ValueError: If a number is below 1
+    :param kind: Kind of the graph's picture: ``"heat_map"``, ``"graph"`` or ``"both"``
+    :param view: What the graph's picture shows: a :class:`~sb3_causalgdp.causal.plots.View`, or its fields by name
+    :raises ValueError: If a number is below 1, or a field of the view is not known or out of range
     """
 
     model: CausalGDP
 
     def __init__(
-        self, save_freq: int = 10_000, folder: str | os.PathLike[str] | None = None, batch_size: int = 256, verbose: int = 0
+        self,
+        save_freq: int = 10_000,
+        folder: str | os.PathLike[str] | None = None,
+        batch_size: int = 256,
+        verbose: int = 0,
+        kind: str = "heat_map",
+        view: View | Mapping[str, Any] | None = None,
     ) -> None:
         super().__init__(verbose)
         for name, value in (("save_freq", save_freq), ("batch_size", batch_size)):
@@ -64,6 +73,9 @@ class CausalPicturesCallback(BaseCallback):
         self.save_freq = save_freq
         self.folder = None if folder is None else Path(folder)
         self.batch_size = batch_size
+        check_choice("kind", kind, KINDS)
+        self.kind = kind
+        self.view = view if isinstance(view, View) else view_of(None, view or {})
         self._last_steps = 0
 
     def _init_callback(self) -> None:
@@ -107,7 +119,7 @@ class CausalPicturesCallback(BaseCallback):
 
     def _plots(self) -> Iterator[tuple[str, Callable[[Path | None], Figure]]]:
         model = self.model
-        yield "graph", lambda path: plot_causal_graph(model.causal_graph(), path, kind="heat_map")
+        yield "graph", lambda path: plot_causal_graph(model.causal_graph(), path, self.kind, self.view)
         buffer = next((one for one in (model.replay_buffer, model.offline_buffer) if one is not None and one.size() > 0), None)
         if buffer is None:
             # A loaded model starts with an empty buffer

@@ -15,6 +15,7 @@ from stable_baselines3.common.type_aliases import PyTorchObs
 
 from sb3_causalgdp.callbacks.diagnostics import guidance_divergence, step_size_bound
 from sb3_causalgdp.causal import min_rows
+from sb3_causalgdp.causal.description import count_of_edges
 
 
 class CausalWorldModelCallback(BaseCallback):
@@ -94,10 +95,11 @@ class CausalWorldModelCallback(BaseCallback):
         graph = replace(graph, num_timesteps=int(model.n_environment_steps))
         model.set_causal_graph(graph)
         self.logger.record("causal/n_edges", graph.n_edges)
+        self.logger.record("causal/expected_edges", graph.expected_edges)
         self.logger.record("causal/change", graph.change_since(before))
         self.logger.record("causal/refresh_seconds", time.perf_counter() - start)
         if self.verbose >= 1:
-            print(f"Causal graph at {model.num_timesteps} steps: {graph.n_edges} edges from {graph.n_samples} transitions")
+            print(f"Causal graph at {model.num_timesteps} steps: {count_of_edges(graph)}, from {graph.n_samples} transitions")
         self._log_diagnostics()
 
     def _say_too_few(self, n_samples: int, needed: int) -> None:

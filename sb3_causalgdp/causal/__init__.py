@@ -1,27 +1,61 @@
 """Causal discovery on transitions and the world model that it masks. Knows nothing of SB3 nor of diffusion."""
 
-from sb3_causalgdp.causal.discovery import (
-    DISCOVERY_METHODS,
-    DiscoveryMethod,
-    Statistics,
-    discover,
-    make_discovery,
-    make_statistics,
-    min_rows,
+from typing import TYPE_CHECKING
+
+from sb3_causalgdp.lazy import lazy_names
+
+if TYPE_CHECKING:
+    from sb3_causalgdp.causal.discovery import (
+        DISCOVERY_METHODS,
+        DiscoveryMethod,
+        Statistics,
+        discover,
+        make_discovery,
+        make_statistics,
+        min_rows,
+    )
+    from sb3_causalgdp.causal.graph import CausalGraph
+    from sb3_causalgdp.causal.guidance import CausalGuidance, LinearisedGuidance, ReturnTarget, RewardTarget
+    from sb3_causalgdp.causal.interventions import (
+        ActionEffects,
+        Counterfactual,
+        EffectStatistics,
+        InterventionalDistribution,
+        StructuralModel,
+        Trajectory,
+    )
+    from sb3_causalgdp.causal.statistics.moments import StreamingMoments
+    from sb3_causalgdp.causal.variables import TransitionVariables
+    from sb3_causalgdp.causal.world_model import MaskedWorldModel
+
+# The command line's help and the variables need no PyTorch
+__getattr__, __dir__ = lazy_names(
+    __name__,
+    {
+        **{
+            name: "sb3_causalgdp.causal.discovery"
+            for name in (
+                *("DISCOVERY_METHODS", "DiscoveryMethod", "Statistics"),
+                *("discover", "make_discovery", "make_statistics", "min_rows"),
+            )
+        },
+        "CausalGraph": "sb3_causalgdp.causal.graph",
+        **{
+            name: "sb3_causalgdp.causal.guidance"
+            for name in ("CausalGuidance", "LinearisedGuidance", "ReturnTarget", "RewardTarget")
+        },
+        **{
+            name: "sb3_causalgdp.causal.interventions"
+            for name in (
+                *("ActionEffects", "Counterfactual", "EffectStatistics"),
+                *("InterventionalDistribution", "StructuralModel", "Trajectory"),
+            )
+        },
+        "StreamingMoments": "sb3_causalgdp.causal.statistics.moments",
+        "TransitionVariables": "sb3_causalgdp.causal.variables",
+        "MaskedWorldModel": "sb3_causalgdp.causal.world_model",
+    },
 )
-from sb3_causalgdp.causal.graph import CausalGraph
-from sb3_causalgdp.causal.guidance import CausalGuidance, LinearisedGuidance, ReturnTarget, RewardTarget
-from sb3_causalgdp.causal.interventions import (
-    ActionEffects,
-    Counterfactual,
-    EffectStatistics,
-    InterventionalDistribution,
-    StructuralModel,
-    Trajectory,
-)
-from sb3_causalgdp.causal.statistics.moments import StreamingMoments
-from sb3_causalgdp.causal.variables import TransitionVariables
-from sb3_causalgdp.causal.world_model import MaskedWorldModel
 
 __all__ = [
     "DISCOVERY_METHODS",

@@ -8,16 +8,19 @@ import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sb3_causalgdp.causal.discovery import DISCOVERY_METHODS, make_discovery, make_statistics
-from sb3_causalgdp.causal.graph import CausalGraph
-from sb3_causalgdp.causal.sources import BATCH_ROWS, TransitionSource, open_source
-from sb3_causalgdp.causal.statistics.degenerate import CONFOUNDED_VIF
+if TYPE_CHECKING:
+    from sb3_causalgdp.causal.graph import CausalGraph
+    from sb3_causalgdp.causal.transitions import TransitionSource
 
-THRESHOLD = 0.5  # of the masks that the summary lists
+# Its help is there at once: what takes time to import (PyTorch, gymnasium) is imported where it is used
+METHODS = ("direct_lingam", "notears", "partial_r2", "perturbed", "world_model")
+BATCH_ROWS = 4096
 SHOWN_EDGES = 40
 SHOWN_VALUES = 8
 SHOWN_GROUPS = 20
@@ -29,23 +32,39 @@ def make_parser() -> argparse.ArgumentParser:
     """
     parser = argparse.ArgumentParser(
         prog="python -m sb3_causalgdp.causal",
-        usage="%(prog)s DATASET_OR_BUFFER [options]",
+        usage="%(prog)s SOURCE [options]",
         description="Find the causal graph of recorded transitions with continuous actions, and print what it says.",
     )
     add = parser.add_argument
     add(
         "source",
-        metavar="DATASET_OR_BUFFER",
-        help="id of a Minari dataset, a replay buffer from model.save_replay_buffer (.npz, .pkl), or an .npz file of the "
-        "arrays observations, actions, next_observations and rewards",
+        metavar="SOURCE",
+        help="a table with --state, --action and --reward (.csv, .tsv, .parquet, .npy, .npz), the id of a Minari dataset, a "
+        "replay buffer from model.save_replay_buffer (.npz, .pkl), or an .npz file of the arrays observations, actions, "
+        "next_observations and rewards",
     )
-    add(
-        "--method", default="partial_r2", help=f"discovery method, one of {', '.join(sorted(DISCOVERY_METHODS))} (%(default)s)"
-    )
+    table = parser.add_argument_group("columns of a table").add_argument
+    table("--state", metavar="NAMES", help="columns of the state, such as level,temperature")
+    table("--action", metavar="NAMES", help="columns of the action")
+    table("--reward", metavar="NAME", help="column of the reward")
+    table("--episode", metavar="NAME", help="column that tells episodes apart (all rows are one)")
+    table("--time", metavar="NAME", help="column that must grow within an episode; no transition over a gap")
+    table("--next-state", metavar="NAMES", help="columns of the next state (the state --lag rows later)")
+    table("--lag", type=_positive, default=1, metavar="N", help="rows from a state to the next one (%(default)s)")
+    table("--drop-missing", action="store_true", help="leave out transitions with a missing value")
+    add("--method", default="partial_r2", help=f"discovery method, one of {', '.join(METHODS)} (%(default)s)")
     add(
         "--method-kwargs", nargs="+", default=[], metavar="KEY=VALUE", help="arguments of the method, or a JSON object of them"
     )
     add("--plot", metavar="FILE", help="image to draw, such as graph.png")
+    add(
+        "--plot-kwargs",
+        nargs="+",
+        default=[],
+        metavar="KEY=VALUE",
+        help="what it shows: kind (both, heat_map, graph), values (effects, masks), causes, groups, max_variables, aggregate, "
+        "size, as for CausalGraph.plot",
+    )
     add("--json", metavar="FILE", help="file for the whole graph, which CausalGraph.load reads")
     add("--window", type=_positive, metavar="N", help="keep the newest N transitions only")
     add("--half-life", type=_positive, metavar="N", help="number of transitions after which an old one weighs half")
@@ -66,9 +85,10 @@ def _positive(text: str) -> int:
     return number
 
 
-def parse_kwargs(items: Sequence[str]) -> dict[str, Any]:
+def parse_kwargs(items: Sequence[str], option: str = "--method-kwargs") -> dict[str, Any]:
     """
     :param items: Each ``key=value``, or a JSON object
+    :param option: What they were given as
     :return: the arguments by name; values are read as JSON, else as Python, else they are strings
     :raises ValueError: on anything else
     """
@@ -78,11 +98,11 @@ def parse_kwargs(items: Sequence[str]) -> dict[str, Any]:
             try:
                 kwargs.update(json.loads(item))
             except (ValueError, RecursionError) as error:
-                raise ValueError(f"--method-kwargs: {item[:80]!r} is no JSON object: {error}") from error
+                raise ValueError(f"{option}: {item[:80]!r} is no JSON object: {error}") from error
         else:
             key, equals, value = item.partition("=")
             if not (equals and key.isidentifier()):
-                raise ValueError(f"--method-kwargs must be key=value or a JSON object, got {item!r}")
+                raise ValueError(f"{option} must be key=value or a JSON object, got {item!r}")
             kwargs[key] = _value_of(value)
     return kwargs
 
@@ -117,12 +137,14 @@ def run(arguments: argparse.Namespace) -> None:
     :param arguments: What the parser made
     :raises ValueError: on what the user got wrong
     """
-    _check_plot(arguments.plot)
+    from sb3_causalgdp.causal.discovery import make_discovery, make_statistics
+
+    drawn = _checked_plot(arguments)
     kwargs = parse_kwargs(arguments.method_kwargs)
     with _as_value_error("--method-kwargs"):
         method = make_discovery(arguments.method, **kwargs)
     start = time.perf_counter()
-    source = open_source(arguments.source, download=arguments.download, max_rows=arguments.max_rows, trusted=arguments.trusted)
+    source, remarks = _open(arguments)
     with _as_value_error("--method-kwargs"):
         statistics = make_statistics(method, source.variables, arguments.half_life, arguments.window)
     if source.n_rows == 0:
@@ -134,6 +156,7 @@ def run(arguments: argparse.Namespace) -> None:
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         graph = method(statistics, source.variables)
+    graph = replace(graph, remarks=(*graph.remarks, *remarks))
     found = time.perf_counter()
     if arguments.json is not None:
         graph.save(arguments.json)
@@ -143,15 +166,66 @@ def run(arguments: argparse.Namespace) -> None:
     for warning in caught:
         print(f"warning: {warning.message}", file=sys.stderr)
     if arguments.plot is not None:
-        graph.plot(arguments.plot)
+        graph.plot(arguments.plot, **drawn)
 
 
-def _check_plot(path: str | None) -> None:
-    """Before anything is read, so that a missing package or a wrong suffix costs no time."""
-    if path is not None:
-        from sb3_causalgdp.causal.plots.figures import check_suffix
+def _checked_plot(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Before anything is read, so that a missing package or a wrong option costs no time."""
+    options = parse_kwargs(arguments.plot_kwargs, "--plot-kwargs")
+    if arguments.plot is None:
+        if options:
+            raise ValueError("--plot-kwargs need --plot FILE")
+        return {}
+    from sb3_causalgdp.causal.plots.figures import check_choice, check_suffix
+    from sb3_causalgdp.causal.plots.graphs import KINDS
+    from sb3_causalgdp.causal.plots.view import view_of
 
-        check_suffix(path)
+    check_suffix(arguments.plot)
+    kind = options.pop("kind", "both")
+    with _as_value_error("--plot-kwargs"):
+        check_choice("kind", kind, KINDS)
+        return {"kind": kind, "view": view_of(None, options)}
+
+
+def _open(arguments: argparse.Namespace) -> "tuple[TransitionSource, tuple[str, ...]]":
+    """The source, and what is to be said of it."""
+    from sb3_causalgdp.sources.columns import SUFFIXES
+
+    roles = {name: getattr(arguments, name) for name in ("state", "action", "reward", "episode", "time", "next_state")}
+    path = Path(arguments.source)
+    is_table = path.suffix.lower() in SUFFIXES and path.suffix.lower() != ".npz"
+    if not is_table and not any(roles.values()):
+        from sb3_causalgdp.causal.sources import open_source
+
+        source = open_source(
+            arguments.source, download=arguments.download, max_rows=arguments.max_rows, trusted=arguments.trusted
+        )
+        return source, ()
+    from sb3_causalgdp.causal.transitions import TableSource
+    from sb3_causalgdp.sources.columns import read_columns
+    from sb3_causalgdp.sources.tables import Table
+
+    columns = read_columns(path)
+    missing = [f"--{name}" for name in ("state", "action", "reward") if roles[name] is None]
+    if missing:
+        raise ValueError(f"{path} is a table and needs {', '.join(missing)}: its columns are {', '.join(columns)}")
+    table = Table(
+        columns,
+        states=_names(roles["state"]),
+        actions=_names(roles["action"]),
+        reward=roles["reward"],
+        episode=roles["episode"],
+        time=roles["time"],
+        next_states=None if roles["next_state"] is None else _names(roles["next_state"]),
+        lag=arguments.lag,
+        missing="drop" if arguments.drop_missing else "raise",
+        name=str(path),
+    )
+    return TableSource(table, arguments.max_rows), table.remarks
+
+
+def _names(text: str) -> list[str]:
+    return [name.strip() for name in text.split(",") if name.strip()]
 
 
 @contextmanager
@@ -163,7 +237,7 @@ def _as_value_error(argument: str) -> Iterator[None]:
         raise ValueError(f"{argument}: {error}") from error
 
 
-def feed(statistics: Any, source: TransitionSource, batch_rows: int = BATCH_ROWS, quiet: bool = False) -> None:
+def feed(statistics: Any, source: "TransitionSource", batch_rows: int = BATCH_ROWS, quiet: bool = False) -> None:
     """
     Hand all rows of a source to the statistics of a method.
 
@@ -188,7 +262,7 @@ def feed(statistics: Any, source: TransitionSource, batch_rows: int = BATCH_ROWS
                 advance(len(rows))
 
 
-def _check_finite(rows: np.ndarray, n_read: int, source: TransitionSource) -> None:
+def _check_finite(rows: np.ndarray, n_read: int, source: "TransitionSource") -> None:
     bad = ~np.isfinite(rows)
     if bad.any():
         row = int(bad.any(axis=1).argmax())
@@ -213,12 +287,14 @@ def _progress(label: str, n_rows: int, quiet: bool) -> Iterator[Callable[[int], 
 # Summary ----------------------------------------------------------------------------------------------------------------
 
 
-def summary_of(graph: CausalGraph, source: TransitionSource) -> str:
+def summary_of(graph: "CausalGraph", source: "TransitionSource") -> str:
     """
     :param graph: The graph
     :param source: What it was found from
     :return: the edges and what limits them, in lines for a terminal
     """
+    from sb3_causalgdp.causal.statistics.degenerate import CONFOUNDED_VIF
+
     variables = source.variables
     part = "" if source.n_rows == source.n_stored else f" of {source.n_stored:,}"
     lines = [
@@ -241,11 +317,13 @@ def summary_of(graph: CausalGraph, source: TransitionSource) -> str:
     return "\n".join(lines)
 
 
-def _edge_lines(graph: CausalGraph) -> list[str]:
-    edges = [edge for edge in graph.edges() if edge.mask > THRESHOLD]
+def _edge_lines(graph: "CausalGraph") -> list[str]:
+    from sb3_causalgdp.causal.description import count_of_edges
+
+    edges = graph.edges()
     edges.sort(key=lambda edge: (-round(edge.mask, 2), -abs(edge.strength)))
     shown = edges[:SHOWN_EDGES]
-    lines = [f"{graph.method}: {len(edges)} of {graph.masks.size} possible edges have a mask above {THRESHOLD:g}"]
+    lines = [f"{graph.method}: {count_of_edges(graph)}"]
     width = max((len(edge.cause) for edge in shown), default=0)
     for edge in shown:
         error = "" if np.isnan(edge.standard_error) else f" +- {edge.standard_error:<7.2g}"

@@ -3,10 +3,13 @@ import os
 from collections.abc import Iterable
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from sb3_causalgdp.causal import description
+from sb3_causalgdp.causal.drawing import PLOTS_HINT, frame_of, picture
+from sb3_causalgdp.causal.edges import EDGE_PROBABILITY, Edge, GraphDiff, strongest_in_rows
 from sb3_causalgdp.causal.variables import TransitionVariables
 from sb3_causalgdp.files import replaced_when_done
 from sb3_causalgdp.saving.archives import errors_of
@@ -16,54 +19,16 @@ if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.figure import Figure
 
-    from sb3_causalgdp.causal.plots.summary import Groups
-
-PLOTS_HINT = 'matplotlib and networkx are needed for this: pip install "sb3_causalgdp[plots]"'
+__all__ = ["EDGE_PROBABILITY", "PLOTS_HINT", "CausalGraph", "Edge", "GraphDiff"]
 
 
-class Edge(NamedTuple):
-    """One edge: names of cause and effect, mask in [0, 1], signed strength and its standard error (NaN: not known)."""
-
-    cause: str
-    effect: str
-    mask: float
-    strength: float
-    standard_error: float
-
-    def __str__(self) -> str:
-        error = "" if np.isnan(self.standard_error) else f" +- {self.standard_error:.2g}"
-        return f"{self.cause} -> {self.effect}: mask {self.mask:.2f}, strength {self.strength:+.2f}{error}"
-
-
-class GraphDiff(NamedTuple):
-    """
-    What changed from an earlier graph to a later one. Edges are as in the later graph, closed ones as in the earlier.
-
-    :param opened: Edges that were closed
-    :param closed: Edges that were open and are not any more
-    :param strengthened: Open in both, with a larger effect
-    :param weakened: Open in both, with a smaller effect
-    :param flipped: Open in both, with an effect of the other sign
-    """
-
-    opened: list[Edge]
-    closed: list[Edge]
-    strengthened: list[Edge]
-    weakened: list[Edge]
-    flipped: list[Edge]
-
-    def __str__(self) -> str:
-        lines = []
-        for name, edges in self._asdict().items():
-            if edges:
-                lines += [f"{name} ({len(edges)}):", *(f"  {edge}" for edge in edges)]
-        return "\n".join(lines) or "no edge changed"
-
-
-@dataclass(eq=False)
+@dataclass(eq=False, repr=False)
 class CausalGraph:
     """
-    What causes what in one transition: soft masks, and the signed effects beside them.
+    What causes what in one transition: soft masks, and the signed effects beside them; ``print`` shows the strongest.
+
+    An *edge* is a pair whose mask is above :data:`EDGE_PROBABILITY` (0.5), everywhere in this package; as masks are
+    probabilities, their sum is the expected number of edges.
 
     Everything lies in one layout, shape (n + 1, n + d): a row for each next state s'_j and, last, the reward; a column for
     each state and action. In the reward's row the states are those of the *next* step: it says which s_{t+1} cause r_t. The
@@ -221,9 +186,29 @@ class CausalGraph:
         return all(_equal(getattr(self, f.name), getattr(other, f.name)) for f in fields(self))
 
     @property
+    def is_discovered(self) -> bool:
+        """Whether it was found in data; False for what stands for a graph before the first discovery."""
+        return not (self.method == "none" and self.n_samples == 0)
+
+    @property
     def n_edges(self) -> int:
-        """Number of open edges (mask > 0)."""
-        return int(np.count_nonzero(self.masks))
+        """Number of edges: masks above 0.5."""
+        return int(np.count_nonzero(self.masks > EDGE_PROBABILITY))
+
+    @property
+    def expected_edges(self) -> float:
+        """Expected number of edges: the sum of the masks."""
+        return float(self.masks.sum())
+
+    def __repr__(self) -> str:
+        n_states, n_actions = self.variables.n_states, self.variables.n_actions
+        return f"<CausalGraph {self.method!r}: {n_states} states, {n_actions} actions, {description.count_of_edges(self)}>"
+
+    def __str__(self) -> str:
+        return description.as_text(self)
+
+    def _repr_html_(self) -> str:
+        return description.as_html(self)
 
     def change_since(self, other: "CausalGraph") -> float:
         """
@@ -234,19 +219,18 @@ class CausalGraph:
         self._check_same_variables(other)
         return float(np.abs(self.masks - other.masks).mean())
 
-    def diff(self, other: "CausalGraph", threshold: float = 0.5, min_change: float = 0.1) -> GraphDiff:
+    def diff(self, other: "CausalGraph", threshold: float = EDGE_PROBABILITY, min_change: float = 0.1) -> GraphDiff:
         """
         What changed since an earlier graph, edge by edge; ``print`` shows it.
 
         :param other: The earlier graph, over the same variables
-        :param threshold: Masks above it are open edges, in [0, 1)
+        :param threshold: Masks above it are edges, in [0, 1)
         :param min_change: Smallest change of an open edge's effect that counts, in standardised units, at least 0
         :return: the edges that opened, closed, or whose effect changed
         :raises ValueError: when the variables differ or a number is out of range
         """
         self._check_same_variables(other)
-        if not 0 <= threshold < 1:
-            raise ValueError(f"threshold must be in [0, 1), got {threshold!r}")
+        _check_threshold(threshold)
         if not min_change >= 0:
             raise ValueError(f"min_change must be at least 0, got {min_change!r}")
         before, now = other.masks > threshold, self.masks > threshold
@@ -265,29 +249,43 @@ class CausalGraph:
         if other.variables != self.variables:
             raise ValueError(f"other must be over the same variables {self.variables.names}, got {other.variables.names}")
 
-    def edges(self) -> list[Edge]:
+    def edges(self, threshold: float = EDGE_PROBABILITY) -> list[Edge]:
         """
-        :return: all open edges (mask > 0), grouped by effect, in the order of the variables
+        :param threshold: Masks above it are edges, in [0, 1); 0 gives all that are not closed
+        :return: the edges, grouped by effect, in the order of the variables
+        :raises ValueError: when the threshold is out of range
         """
-        return self._edges(self.masks > 0)
+        _check_threshold(threshold)
+        return self._edges(self.masks > threshold)
+
+    def strongest_edges(self, per_effect: int = 3, for_reward: int | None = None) -> list[Edge]:
+        """
+        The strongest causes of every effect, by how strong they are at least (two standard errors nearer to zero). An effect
+        without an edge gives the one candidate that comes closest, with a mask of 0.5 or below.
+
+        :param per_effect: Number of causes of a next state, at least 1; causes as strong as the last one are there, too
+        :param for_reward: Number of causes of the reward; None for as many
+        :return: the edges, grouped by effect, the strongest first
+        :raises ValueError: when a number is below 1
+        """
+        columns = strongest_in_rows(self, per_effect, for_reward)
+        return [self._edge(row, column) for row, chosen in enumerate(columns) for column in chosen]
 
     def _edges(self, chosen: np.ndarray) -> list[Edge]:
         """The edges at the True entries of an array of the masks' shape."""
+        return [self._edge(row, column) for row, column in np.argwhere(chosen)]
+
+    def _edge(self, row: int, column: int) -> Edge:
         variables = self.variables
-        errors = np.full_like(self.masks, np.nan) if self.standard_errors is None else self.standard_errors
-        causes_of_state = (*variables.state_names, *variables.action_names)
-        causes_of_reward = (*variables.next_state_names, *variables.action_names)
-        effects = (*variables.next_state_names, "reward")
-        return [
-            Edge(
-                cause=(causes_of_state if j < variables.n_states else causes_of_reward)[i],
-                effect=effects[j],
-                mask=float(self.masks[j, i]),
-                strength=float(self.effects[j, i]),
-                standard_error=float(errors[j, i]),
-            )
-            for j, i in np.argwhere(chosen)
-        ]
+        causes = variables.state_names if row < variables.n_states else variables.next_state_names
+        errors = self.standard_errors
+        return Edge(
+            cause=(*causes, *variables.action_names)[column],
+            effect=(*variables.next_state_names, "reward")[row],
+            mask=float(self.masks[row, column]),
+            strength=float(self.effects[row, column]),
+            standard_error=float("nan") if errors is None else float(errors[row, column]),
+        )
 
     def to_dataframe(self) -> "pd.DataFrame":
         """
@@ -295,15 +293,12 @@ class CausalGraph:
             the fields of :class:`Edge`
         :raises ImportError: when pandas is missing
         """
-        try:
-            import pandas as pd
-        except ImportError as error:
-            raise ImportError("pandas is needed for this: pip install pandas") from error
-        return pd.DataFrame(self._edges(np.ones_like(self.masks)), columns=list(Edge._fields))
+        return frame_of(self._edges(np.ones_like(self.masks)), Edge._fields)
 
-    def to_networkx(self) -> "nx.DiGraph":
+    def to_networkx(self, threshold: float = EDGE_PROBABILITY) -> "nx.DiGraph":
         """
-        :return: directed graph of all variables and the open edges; nodes have ``layer`` (0: s_t and a_t, 1: s_{t+1},
+        :param threshold: Masks above it are edges, in [0, 1)
+        :return: directed graph of all variables and the edges; nodes have ``layer`` (0: s_t and a_t, 1: s_{t+1},
             2: reward), edges have ``mask`` and ``strength``
         :raises ImportError: when networkx is missing
         """
@@ -315,7 +310,7 @@ class CausalGraph:
         graph.add_nodes_from((*self.variables.state_names, *self.variables.action_names), layer=0)
         graph.add_nodes_from(self.variables.next_state_names, layer=1)
         graph.add_node("reward", layer=2)
-        for edge in self.edges():
+        for edge in self.edges(threshold):
             graph.add_edge(edge.cause, edge.effect, mask=edge.mask, strength=edge.strength)
         return graph
 
@@ -372,31 +367,25 @@ class CausalGraph:
             return cls.from_json(Path(path).read_text(encoding="utf-8"))
 
     def plot(
-        self,
-        path: str | os.PathLike[str] | None = None,
-        kind: str = "both",
-        max_variables: int = 40,
-        *,
-        values: str = "masks",
-        groups: "Groups" = "auto",
-        aggregate: str = "mean",
+        self, path: str | os.PathLike[str] | None = None, kind: str = "both", view: Any = None, **options: Any
     ) -> "Figure":
         """
         Draw the graph, without pyplot's global state (a notebook shows the figure after ``%matplotlib inline``).
 
         :param path: Image file to write, by its suffix; None writes nothing
         :param kind: ``"heat_map"``, ``"graph"`` or ``"both"``
-        :param max_variables: More states and actions than this are summarised, see ``groups``
-        :param values: What the heat map's colours are: ``"masks"``, with the signs of the effects, or ``"effects"``
-        :param groups: How to summarise, see :func:`~sb3_causalgdp.causal.plots.summary.summarize`
-        :param aggregate: ``"mean"`` or ``"max"`` of a group's entries
+        :param view: What is drawn: a :class:`~sb3_causalgdp.causal.plots.View`
+        :param options: Fields of the view by name, such as ``values="masks"`` or ``causes=5``
         :return: the matplotlib figure
         :raises ImportError: when matplotlib or networkx is missing
         :raises ValueError: on an argument out of range
         """
-        from sb3_causalgdp.causal.plots import plot_causal_graph
+        return picture("plot_causal_graph")(self, path, kind, view, **options)
 
-        return plot_causal_graph(self, path, kind, max_variables, values=values, groups=groups, aggregate=aggregate)
+
+def _check_threshold(threshold: float) -> None:
+    if not 0 <= threshold < 1:
+        raise ValueError(f"threshold must be in [0, 1), got {threshold!r}")
 
 
 def _equal(one: Any, other: Any) -> bool:

@@ -1,141 +1,48 @@
 """Interventions, effects and counterfactuals on the masked world model, in the environment's own units."""
 
 import difflib
-import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, NamedTuple
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 import numpy.typing as npt
 import torch as th
 
+from sb3_causalgdp.causal.answers import (
+    ActionEffects,
+    Counterfactual,
+    EffectStatistics,
+    InterventionalDistribution,
+    Trajectory,
+)
+from sb3_causalgdp.causal.rows import (
+    EffectAverage,
+    as_array,
+    as_column,
+    as_vector,
+    checked_positive,
+    checked_rows,
+    chunks,
+    replace_columns,
+    same_batch,
+)
 from sb3_causalgdp.causal.variables import TransitionVariables
 from sb3_causalgdp.causal.world_model import MaskedWorldModel
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+__all__ = [
+    "ActionEffects",
+    "ActionRule",
+    "Counterfactual",
+    "EffectStatistics",
+    "InterventionalDistribution",
+    "PolicyFunction",
+    "StructuralModel",
+    "Trajectory",
+]
 
 ActionRule = Callable[[int, np.ndarray, np.ndarray], float]
 """Value of one action component, from the step t, the counterfactual state (n,) and the action (d,) that it would change."""
 PolicyFunction = Callable[[np.ndarray], npt.ArrayLike]
 """Action (d,) at a state (n,), both in the environment's units."""
-
-
-class InterventionalDistribution(NamedTuple):
-    """Gaussian next state and reward under do(...); for one observation without the axis of the batch."""
-
-    next_state: np.ndarray
-    """Mean of s', shape ``(batch, n)``."""
-    next_state_std: np.ndarray
-    """Standard deviation of s', 0 where s'_j was set, shape ``(batch, n)``."""
-    reward: np.ndarray
-    """Mean of r, shape ``(batch,)``."""
-    reward_std: np.ndarray
-    """Standard deviation of r, that of s' propagated, shape ``(batch,)``."""
-
-
-class EffectStatistics(NamedTuple):
-    """Effects of the d action components, averaged over observations; the last axis has length d."""
-
-    mean: np.ndarray
-    """Signed mean."""
-    standard_error: np.ndarray
-    """Of the signed mean, for independent observations; NaN for a single one."""
-    mean_absolute: np.ndarray
-    """Mean of the absolute values: large where the sign changes with the state but the effect is strong."""
-
-    def scaled(self, factor: np.ndarray) -> "EffectStatistics":
-        """
-        :param factor: Positive, broadcast against the statistics
-        """
-        return EffectStatistics(*(values * factor for values in self))
-
-
-@dataclass(frozen=True, eq=False)
-class ActionEffects:
-    """
-    Total causal effect of each action component on the reward and on each next state variable.
-
-    :param variables: Names of the variables
-    :param reward: Total effect on the reward, shape ``(d,)``
-    :param reward_direct: Of it a -> r, with the next state held where it is
-    :param reward_through_state: Of it a -> s' -> r, with the reward's own action held where it is
-    :param next_state: Effect on the next state, shape ``(n, d)``
-    :param action_half_range: Half of each action's range, in the environment's units, shape ``(d,)``
-    :param state_std: Running standard deviation of the states, in the environment's units, shape ``(n,)``
-    :param reward_std: Running standard deviation of the rewards, in the environment's units
-    :param n_observations: Number of observations that were averaged
-    :param is_standardised: Whether the units are standardised, see :meth:`standardised`
-    """
-
-    variables: TransitionVariables
-    reward: EffectStatistics
-    reward_direct: EffectStatistics
-    reward_through_state: EffectStatistics
-    next_state: EffectStatistics
-    action_half_range: np.ndarray
-    state_std: np.ndarray
-    reward_std: float
-    n_observations: int
-    is_standardised: bool = False
-
-    def standardised(self) -> "ActionEffects":
-        """
-        :return: The effects in running standard deviations of the outcome for half of the action's range, so that actions and
-            outcomes of all units compare
-        """
-        if self.is_standardised:
-            return self
-        by_reward = self.action_half_range / self.reward_std
-        return replace(
-            self,
-            reward=self.reward.scaled(by_reward),
-            reward_direct=self.reward_direct.scaled(by_reward),
-            reward_through_state=self.reward_through_state.scaled(by_reward),
-            next_state=self.next_state.scaled(self.action_half_range / self.state_std[:, None]),
-            is_standardised=True,
-        )
-
-    def plot(self, path: str | os.PathLike[str] | None = None, max_actions: int = 20, max_states: int = 30) -> "Figure":
-        """
-        Draw the standardised effects: bars for the reward, a heat map for the next state.
-
-        :param path: Image file to write, by its suffix; None writes nothing
-        :param max_actions: Draw at most this many actions, those with the largest mean absolute effect
-        :param max_states: Draw at most this many next state variables, those with the largest mean absolute effect
-        :return: the matplotlib figure
-        :raises ImportError: when matplotlib is missing
-        """
-        from sb3_causalgdp.causal.plots.effects import plot_action_effects
-
-        return plot_action_effects(self, path, max_actions, max_states)
-
-
-class Trajectory(NamedTuple):
-    """T consecutive steps of one episode, in the environment's units."""
-
-    states: np.ndarray
-    """Shape ``(T + 1, n)``."""
-    actions: np.ndarray
-    """Shape ``(T, d)``."""
-    rewards: np.ndarray
-    """Shape ``(T,)``."""
-
-
-class Counterfactual(NamedTuple):
-    """What would have been, in the environment's units, and the noise under which it would."""
-
-    states: np.ndarray
-    """Shape ``(T + 1, n)``; the first is the recorded one."""
-    actions: np.ndarray
-    """Shape ``(T, d)``."""
-    rewards: np.ndarray
-    """Shape ``(T,)``."""
-    state_noise: np.ndarray
-    """Abducted noise of s', in the model's standard deviations: large where it does not explain a step, ``(T, n)``."""
-    reward_noise: np.ndarray
-    """Abducted noise of r, in the model's standard deviations, shape ``(T,)``."""
 
 
 class StructuralModel:
@@ -189,14 +96,14 @@ class StructuralModel:
             )
         self.world_model = world_model
         self.variables = variables
-        self.action_low = _vector("action_low", action_low, n_actions)
-        self.action_high = _vector("action_high", action_high, n_actions)
+        self.action_low = as_vector("action_low", action_low, n_actions)
+        self.action_high = as_vector("action_high", action_high, n_actions)
         if not (np.isfinite([self.action_low, self.action_high]).all() and (self.action_low < self.action_high).all()):
             raise ValueError(f"Action bounds must be finite and ordered, got {self.action_low} and {self.action_high}")
-        self.state_offset = _vector("state_offset", state_offset, n_states)
-        self.state_scale = _positive("state_scale", _vector("state_scale", state_scale, n_states))
-        self.state_clip = _positive("state_clip", _vector("state_clip", state_clip, n_states))
-        self.reward_scale = float(_positive("reward_scale", np.asarray(reward_scale, dtype=np.float64)))
+        self.state_offset = as_vector("state_offset", state_offset, n_states)
+        self.state_scale = checked_positive("state_scale", as_vector("state_scale", state_scale, n_states))
+        self.state_clip = checked_positive("state_clip", as_vector("state_clip", state_clip, n_states))
+        self.reward_scale = float(checked_positive("reward_scale", np.asarray(reward_scale, dtype=np.float64)))
 
     # The model in the environment's units -----------------------------------------------------------------------------------
 
@@ -223,23 +130,23 @@ class StructuralModel:
         """Mean, shape ``(batch, n)``, and standard deviation, shape ``(n,)``."""
         state, action = self._model_state(self._tensor(states)), self._model_action(actions)
         mean, std = self.world_model.predict_next_state(state, action)
-        return self.state_offset + self.state_scale * _array(mean), self.state_scale * _array(std)
+        return self.state_offset + self.state_scale * as_array(mean), self.state_scale * as_array(std)
 
     @th.no_grad()
     def _predict_reward(self, next_states: np.ndarray, actions: np.ndarray) -> tuple[np.ndarray, float]:
         """Mean, shape ``(batch,)``, and standard deviation."""
         next_state, action = self._model_state(self._tensor(next_states)), self._model_action(actions)
         mean, std = self.world_model.predict_reward(next_state, action)
-        return self.reward_scale * _array(mean), self.reward_scale * float(std)
+        return self.reward_scale * as_array(mean), self.reward_scale * float(std)
 
     # Checks -----------------------------------------------------------------------------------------------------------------
 
     def _state_rows(self, values: npt.ArrayLike, name: str) -> np.ndarray:
-        return _rows(values, self.variables.n_states, name)
+        return checked_rows(values, self.variables.n_states, name)
 
     def _action_rows(self, values: npt.ArrayLike, name: str) -> np.ndarray:
         """Finite and within the bounds; what rounding has pushed over a bound is put back on it."""
-        rows = _rows(values, self.variables.n_actions, name)
+        rows = checked_rows(values, self.variables.n_actions, name)
         slack = self.BOUND_TOLERANCE * self.action_half_range
         outside = ((rows < self.action_low - slack) | (rows > self.action_high + slack)).reshape(-1, self.variables.n_actions)
         if outside.any():
@@ -291,22 +198,30 @@ class StructuralModel:
         states = self._state_rows(observation, "observation")
         actions = self._action_rows(action, "action")
         is_single = states.ndim == 1 and actions.ndim == 1
-        states, actions = _same_batch(states, actions)
-        values = {name: _column(name, value, len(states)) for name, value in interventions.items()}
-        _replace(states, self.variables.state_names, values)
-        _replace(actions, self.variables.action_names, values)
+        states, actions = same_batch(states, actions)
+        values = {name: as_column(name, value, len(states)) for name, value in interventions.items()}
+        replace_columns(states, self.variables.state_names, values)
+        replace_columns(actions, self.variables.action_names, values)
         actions = self._action_rows(actions, "interventions")
 
         next_states, std = self._predict_next_state(states, actions)
         stds = np.tile(std, (len(states), 1))
-        _replace(next_states, self.variables.next_state_names, values)
-        _replace(stds, self.variables.next_state_names, dict.fromkeys(values, np.zeros(len(stds))))
+        replace_columns(next_states, self.variables.next_state_names, values)
+        replace_columns(stds, self.variables.next_state_names, dict.fromkeys(values, np.zeros(len(stds))))
         if n_samples is None:
             rewards, reward_stds = self._reward_by_delta_method(next_states, stds, actions)
         else:
             rewards, reward_stds = self._reward_by_sampling(next_states, stds, actions, n_samples, seed)
-        outcome = InterventionalDistribution(next_states, stds, rewards, reward_stds)
-        return InterventionalDistribution(*(values[0] for values in outcome)) if is_single else outcome
+        without = self.intervene(observation, action, {}, n_samples, seed) if interventions else None
+        if is_single:
+            next_states, stds, rewards, reward_stds = (values[0] for values in (next_states, stds, rewards, reward_stds))
+        running_std = self._running_std()
+        return InterventionalDistribution(next_states, stds, rewards, reward_stds, self.variables, running_std, without)
+
+    def _running_std(self) -> np.ndarray:
+        """Of the states and, last, of the reward, in the environment's units, shape ``(n + 1,)``."""
+        states = self.state_scale * as_array(self.world_model.state_std)
+        return np.append(states, self.reward_scale * float(self.world_model.reward_scale))
 
     def _reward_by_delta_method(
         self, next_states: np.ndarray, stds: np.ndarray, actions: np.ndarray
@@ -315,8 +230,8 @@ class StructuralModel:
             next_state = self._tensor(next_states).requires_grad_()
             mean, std = self.world_model.predict_reward(self._model_state(next_state), self._model_action(actions))
             (gradient,) = th.autograd.grad(mean.sum(), next_state)
-        variance = ((_array(gradient) * stds) ** 2).sum(axis=1) + float(std.detach()) ** 2
-        return self.reward_scale * _array(mean), self.reward_scale * np.sqrt(variance)
+        variance = ((as_array(gradient) * stds) ** 2).sum(axis=1) + float(std.detach()) ** 2
+        return self.reward_scale * as_array(mean), self.reward_scale * np.sqrt(variance)
 
     def _reward_by_sampling(
         self, next_states: np.ndarray, stds: np.ndarray, actions: np.ndarray, n_samples: int, seed: int
@@ -360,18 +275,19 @@ class StructuralModel:
         :raises ValueError: On a wrong shape, a value that is not finite, an action outside of its bounds or a delta that is
             not positive
         """
-        states, actions = _same_batch(self._state_rows(observations, "observations"), self._action_rows(actions, "actions"))
+        states, actions = same_batch(self._state_rows(observations, "observations"), self._action_rows(actions, "actions"))
         if delta is not None:
-            step = _positive("delta", _vector("delta", delta, self.variables.n_actions))
+            step = checked_positive("delta", as_vector("delta", delta, self.variables.n_actions))
             if not np.isfinite(step).all():
                 raise ValueError(f"delta must be finite, got {delta!r}")
-        averages = tuple(_EffectAverage() for _ in range(4))
-        for rows in _chunks(len(states), self.ROWS_PER_CHUNK):
+        averages = tuple(EffectAverage() for _ in range(4))
+        for rows in chunks(len(states), self.ROWS_PER_CHUNK):
             chunk = states[rows], actions[rows]
             effects = self._derivatives(*chunk) if delta is None else self._difference_quotients(*chunk, step)
             for average, values in zip(averages, effects, strict=True):
                 average.update(values)
         total, direct, through_state, next_state = (average.statistics() for average in averages)
+        running_std = self._running_std()
         return ActionEffects(
             self.variables,
             total,
@@ -379,8 +295,8 @@ class StructuralModel:
             through_state,
             next_state,
             action_half_range=self.action_half_range,
-            state_std=self.state_scale * _array(self.world_model.state_std),
-            reward_std=self.reward_scale * float(self.world_model.reward_scale),
+            state_std=running_std[:-1],
+            reward_std=float(running_std[-1]),
             n_observations=len(states),
         )
 
@@ -390,8 +306,8 @@ class StructuralModel:
         response = self.world_model.action_response(self._model_state(self._tensor(states)), action)
         through_state = response.through_next_state(response.reward_by_next_state)
         per_unit = self.reward_scale / self.action_half_range
-        next_state_effect = _array(response.next_state_jacobian) * self.state_scale[:, None] / self.action_half_range
-        direct, through = _array(response.reward_by_action) * per_unit, _array(through_state) * per_unit
+        next_state_effect = as_array(response.next_state_jacobian) * self.state_scale[:, None] / self.action_half_range
+        direct, through = as_array(response.reward_by_action) * per_unit, as_array(through_state) * per_unit
         return direct + through, direct, through, next_state_effect
 
     def _difference_quotients(self, states: np.ndarray, actions: np.ndarray, delta: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -463,7 +379,10 @@ class StructuralModel:
             reward_noise[t] = (recorded.rewards[t] - expected_reward[0]) / reward_std
             replayed_reward, _ = self._predict_reward(states[after], actions[now])
             rewards[now] = recorded.rewards[now] + (replayed_reward - expected_reward)
-        return Counterfactual(states, actions, rewards, state_noise, reward_noise)
+        noise_std = np.append(state_std, reward_std) if n_steps else np.zeros(self.variables.n_states + 1)
+        return Counterfactual(
+            states, actions, rewards, state_noise, reward_noise, self.variables, recorded, noise_std, self._running_std()
+        )
 
     def _reaction(
         self, policy: PolicyFunction, state: np.ndarray, recorded_state: np.ndarray, recorded_action: np.ndarray | None
@@ -507,89 +426,9 @@ class StructuralModel:
             if callable(change):
                 rules[names.index(name)] = change
             else:
-                rules[names.index(name)] = _fixed_values(_column(name, change, n_steps))
+                rules[names.index(name)] = _fixed_values(as_column(name, change, n_steps))
         return rules
-
-
-class _EffectAverage:
-    """Running sums of effects of shape ``(batch, ...)``."""
-
-    def __init__(self) -> None:
-        self.n_rows = 0
-        self.total: np.ndarray | float = 0.0
-        self.total_square: np.ndarray | float = 0.0
-        self.total_absolute: np.ndarray | float = 0.0
-
-    def update(self, effects: np.ndarray) -> None:
-        self.n_rows += len(effects)
-        self.total = self.total + effects.sum(axis=0)
-        self.total_square = self.total_square + (effects**2).sum(axis=0)
-        self.total_absolute = self.total_absolute + np.abs(effects).sum(axis=0)
-
-    def statistics(self) -> EffectStatistics:
-        mean = np.asarray(self.total / self.n_rows)
-        if self.n_rows > 1:
-            variance = np.maximum(self.total_square - self.n_rows * mean**2, 0.0) / (self.n_rows - 1)
-            standard_error = np.sqrt(variance / self.n_rows)
-        else:
-            standard_error = np.full_like(mean, np.nan)
-        return EffectStatistics(mean, standard_error, np.asarray(self.total_absolute / self.n_rows))
-
-
-def _array(tensor: th.Tensor) -> np.ndarray:
-    return tensor.detach().cpu().numpy().astype(np.float64)
-
-
-def _vector(name: str, values: npt.ArrayLike, size: int) -> np.ndarray:
-    array = np.asarray(values, dtype=np.float64)
-    if array.shape not in ((), (size,)):
-        raise ValueError(f"{name} must be a number or have shape ({size},), got {array.shape}")
-    return np.broadcast_to(array, (size,)).copy()
-
-
-def _positive(name: str, values: np.ndarray) -> np.ndarray:
-    if not (values > 0.0).all():
-        raise ValueError(f"{name} must be positive, got {values.min():g}")
-    return values
-
-
-def _rows(values: npt.ArrayLike, width: int, name: str) -> np.ndarray:
-    rows = np.array(values, dtype=np.float64)
-    if rows.ndim not in (1, 2) or rows.shape[-1] != width or len(rows) == 0:
-        raise ValueError(f"{name} must have shape ({width},) or (batch, {width}), got {rows.shape}")
-    if not np.isfinite(rows).all():
-        raise ValueError(f"{name} must be finite, got {rows[~np.isfinite(rows)][0]}")
-    return rows
-
-
-def _same_batch(states: np.ndarray, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Copies with an axis of the batch; a single row meets every row of the other."""
-    states, actions = np.atleast_2d(states), np.atleast_2d(actions)
-    n_rows = max(len(states), len(actions))
-    if {len(states), len(actions)} - {1, n_rows}:
-        raise ValueError(f"There are {len(states)} observations but {len(actions)} actions")
-    return (
-        np.broadcast_to(states, (n_rows, states.shape[1])).copy(),
-        np.broadcast_to(actions, (n_rows, actions.shape[1])).copy(),
-    )
-
-
-def _column(name: str, value: npt.ArrayLike, n_rows: int) -> np.ndarray:
-    values = _vector(name, value, n_rows)
-    if not np.isfinite(values).all():
-        raise ValueError(f"{name} must be set to finite values, got {values[~np.isfinite(values)][0]}")
-    return values
 
 
 def _fixed_values(values: np.ndarray) -> ActionRule:
     return lambda t, state, action: values[t]
-
-
-def _replace(rows: np.ndarray, names: Sequence[str], values: Mapping[str, np.ndarray]) -> None:
-    for column, name in enumerate(names):
-        if name in values:
-            rows[:, column] = values[name]
-
-
-def _chunks(n_rows: int, size: int) -> Iterator[slice]:
-    return (slice(first, first + size) for first in range(0, n_rows, size))

@@ -3,7 +3,6 @@
 import math
 import os
 import re
-from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -12,6 +11,7 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
+from sb3_causalgdp.causal.transitions import BATCH_ROWS, SourceError, TransitionSource
 from sb3_causalgdp.causal.variables import TransitionVariables
 from sb3_causalgdp.saving.archives import errors_of, existing, is_zip, load_minari, one_line, read_arrays, read_pickle
 from sb3_causalgdp.saving.plain import SPACES, Known, decoded, read_json
@@ -24,11 +24,17 @@ BUFFER_ATTRIBUTES = (
     *("optimize_memory_usage", "observation_space", "action_space"),
 )
 SUFFIXES = (".npz", ".pkl")
-BATCH_ROWS = 4096
 
-
-class SourceError(ValueError):
-    """The source is missing, or does not hold transitions that discovery can use."""
+__all__ = [
+    "BATCH_ROWS",
+    "ArraySource",
+    "FlatSpace",
+    "MinariSource",
+    "ReplayBufferSource",
+    "SourceError",
+    "TransitionSource",
+    "open_source",
+]
 
 
 class FlatSpace:
@@ -108,71 +114,6 @@ def _action_names(space: spaces.Space) -> tuple[str, ...]:
     if not isinstance(space, spaces.Box):
         raise SourceError(f"continuous actions are needed (a Box), got {space}")
     return tuple(f"action[{index}]" for index in range(spaces.flatdim(space)))
-
-
-class TransitionSource(ABC):
-    """
-    Recorded transitions that can be read in batches, as often as one likes.
-
-    :param name: What to call the source
-    :param variables: Names and order of the variables
-    :param n_stored: Number of transitions that it holds
-    :param max_rows: Read at most this many, spread evenly over all; None reads all
-    """
-
-    def __init__(self, name: str, variables: TransitionVariables, n_stored: int, max_rows: int | None = None) -> None:
-        if max_rows is not None and max_rows < 1:
-            raise ValueError(f"max_rows must be None or at least 1, got {max_rows!r}")
-        self.name = name
-        self.variables = variables
-        self.n_stored = n_stored
-        self.n_rows = n_stored if max_rows is None else min(n_stored, max_rows)
-
-    def batches(self, batch_rows: int = BATCH_ROWS) -> Iterator[np.ndarray]:
-        """
-        :param batch_rows: Number of rows of a batch; the last one may be shorter
-        :return: rows ``[s, a, s', r]`` in the order they were recorded, float64, shape (batch_rows, 2 n + d + 1)
-        """
-        waiting: list[np.ndarray] = []
-        n_waiting = 0
-        for part in self._chosen_rows(batch_rows):
-            waiting.append(part)
-            n_waiting += len(part)
-            if n_waiting >= batch_rows:
-                rows = np.concatenate(waiting)
-                n_whole = n_waiting - n_waiting % batch_rows
-                yield from (rows[first : first + batch_rows] for first in range(0, n_whole, batch_rows))
-                waiting, n_waiting = [rows[n_whole:]], n_waiting - n_whole
-        if n_waiting > 0:
-            yield np.concatenate(waiting)
-
-    def _chosen_rows(self, n_rows: int) -> Iterator[np.ndarray]:
-        if self.n_rows == self.n_stored:
-            yield from self._read_parts(n_rows)
-            return
-        chosen = np.linspace(0, self.n_stored - 1, self.n_rows).astype(np.int64)
-        first = 0
-        for part in self._read_parts(n_rows):
-            lower, upper = np.searchsorted(chosen, [first, first + len(part)])
-            yield part[chosen[lower:upper] - first]
-            first += len(part)
-
-    def _read_parts(self, n_rows: int) -> Iterator[np.ndarray]:
-        n_read = 0
-        try:
-            for part in self._parts(n_rows):
-                n_read += len(part)
-                yield part
-        except SourceError:
-            raise
-        except Exception as error:  # of the file's library, or of parts that do not fit together
-            raise SourceError(f"{self.name} is incomplete or damaged behind transition {n_read}: {one_line(error)}") from error
-        if n_read != self.n_stored:
-            raise SourceError(f"{self.name} is incomplete: it announces {self.n_stored} transitions and holds {n_read}")
-
-    @abstractmethod
-    def _parts(self, n_rows: int) -> Iterator[np.ndarray]:
-        """All rows in their order, in parts of any length, ``n_rows`` at most where there is a choice."""
 
 
 class ReplayBufferSource(TransitionSource):

@@ -7,6 +7,7 @@ import time
 import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from inspect import signature
 from typing import Any, TypeVar
 
 import numpy as np
@@ -32,13 +33,14 @@ from sb3_causalgdp.offline.preload import (
     positions_needed,
     preload_buffer,
     prime_normalizer,
-    spaces_of,
 )
 from sb3_causalgdp.offline.replay import SpacesEnv, can_sample
 from sb3_causalgdp.offline.rewards import RewardTransform, SavedRewards, check_reward_transform
 from sb3_causalgdp.offline.saved_buffers import SUFFIXES, can_be_arrays, read_buffer, write_buffer
 from sb3_causalgdp.offline.sources import Source, open_source
+from sb3_causalgdp.offline.spaces import spaces_of
 from sb3_causalgdp.saving.archives import errors_of, existing
+from sb3_causalgdp.sources.tables import Table
 
 SelfAlgorithm = TypeVar("SelfAlgorithm", bound="OfflineToOnlineAlgorithm")
 
@@ -121,19 +123,29 @@ class OfflineToOnlineAlgorithm(OffPolicyAlgorithm):
         source: Any,
         policy: str | type[BasePolicy] = "MlpPolicy",
         n_envs: int = 1,
+        observation_space: spaces.Space | None = None,
+        action_space: spaces.Box | None = None,
         **kwargs,
     ) -> SelfAlgorithm:
         """
         A model with the spaces of a dataset and without an environment, ready for :meth:`preload` and :meth:`pretrain`. It
         learns online after ``set_env``. Dictionaries of observations are flattened, except for a ``MultiInputPolicy``.
 
+        Arrays and tables do not tell their spaces. What is not given is inferred, with a warning that says what: observations
+        of any numbers, and actions between the smallest and the largest.
+
         :param source: As for :meth:`preload`; only its spaces are read
         :param policy: The policy model to use
         :param n_envs: Number of environments that it will learn from
-        :param kwargs: Arguments of the constructor
+        :param observation_space: Space of the observations; None for the source's
+        :param action_space: Space of the actions; None for the source's
+        :param kwargs: Arguments of the constructor; with a data frame or the path of a table also those of
+            :class:`~sb3_causalgdp.sources.tables.Table`, which :meth:`preload` takes then
         :return: The model
         """
-        observation_space, action_space = spaces_of(open_source(source))
+        if "states" in kwargs and not isinstance(source, Table):
+            source = Table(source, **{name: kwargs.pop(name) for name in signature(Table).parameters if name in kwargs})
+        observation_space, action_space = spaces_of(open_source(source), observation_space, action_space)
         layout = observation_space
         policy_class = cls.policy_aliases.get(policy) if isinstance(policy, str) else policy
         if not (policy_class is not None and issubclass(policy_class, cls.policy_aliases["MultiInputPolicy"])):
@@ -226,7 +238,8 @@ class OfflineToOnlineAlgorithm(OffPolicyAlgorithm):
 
         :param source: The id of a Minari dataset (``"D4RL/pointmaze/umaze-v2"``), a ``minari.MinariDataset``, a replay buffer
             of SB3 or the path of a saved one, or arrays: a mapping (or the path of an ``.npz`` file) of ``observations``,
-            ``actions``, ``rewards``, ``next_observations``, ``terminations`` and ``truncations``
+            ``actions``, ``rewards``, ``next_observations``, ``terminations`` and ``truncations``; or a
+            :class:`~sb3_causalgdp.sources.tables.Table`
         :param reward_transform: What is done to the rewards, here and in ``learn()``; None takes the constructor's
         :param progress_bar: Whether to show a progress bar (needs tqdm)
         :param download: Whether to download a dataset that is not on this machine

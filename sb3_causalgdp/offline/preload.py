@@ -14,7 +14,7 @@ from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from sb3_causalgdp.offline.observations import ObservationMap, observation_map, shape_of_arrays
 from sb3_causalgdp.offline.rewards import RewardTransform, check_reward_transform, make_reward_transform
-from sb3_causalgdp.offline.sources import ArraySource, Chunk, Source
+from sb3_causalgdp.offline.sources import Chunk, Source
 
 ACTION_TOLERANCE = 1e-5
 UPDATE_ROWS = 10_000
@@ -429,15 +429,3 @@ def _progress(source: Source, progress_bar: bool) -> Iterator[Any]:
         raise ImportError('progress_bar=True needs tqdm: pip install "sb3_causalgdp[train]"') from error
     with tqdm(total=source.n_transitions, desc=source.name, unit=" transitions", unit_scale=True) as bar:
         yield bar.update
-
-
-def spaces_of(source: Source) -> tuple[spaces.Space, spaces.Box]:
-    """
-    :param source: Offline transitions
-    :return: Its observation and its action space
-    :raises ValueError: If it does not know them
-    """
-    if source.observation_space is None or not isinstance(source.action_space, spaces.Box):
-        kind = "arrays" if isinstance(source, ArraySource) else "this source"
-        raise ValueError(f"{source.name} does not tell its spaces, as {kind} cannot: make the model with an environment")
-    return source.observation_space, source.action_space

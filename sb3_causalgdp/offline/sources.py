@@ -15,6 +15,9 @@ from sb3_causalgdp.offline.extras import OFFLINE_HINT
 from sb3_causalgdp.offline.rewards import RewardTransform, SavedRewards
 from sb3_causalgdp.offline.saved_buffers import SUFFIXES, is_buffer, read_buffer
 from sb3_causalgdp.saving.archives import errors_of, existing, load_minari, one_line, read_arrays
+from sb3_causalgdp.sources.columns import SUFFIXES as TABLE_SUFFIXES
+from sb3_causalgdp.sources.columns import is_frame
+from sb3_causalgdp.sources.tables import Table
 
 MINARI_ID = re.compile(r"(\w+://[-\w]+/)?[-\w]+(/[-\w]+)*-v\d+")
 ARRAYS = ("observations", "actions", "rewards", "next_observations", "terminations", "truncations")
@@ -23,6 +26,7 @@ BUFFER_FIELDS = (
     *("optimize_memory_usage", "observation_space", "action_space"),
 )
 CHUNK_ROWS = 10_000
+TABLE_HINT = "Table(source, states=[...], actions=[...], reward=...) of sb3_causalgdp.sources.tables"
 
 
 @dataclass(frozen=True)
@@ -276,6 +280,23 @@ class ArraySource(Source):
             )
 
 
+class TableSource(ArraySource):
+    """
+    The transitions of a table, in single precision.
+
+    :param table: The table
+    """
+
+    is_in_order = True
+
+    def __init__(self, table: Table) -> None:
+        none = np.zeros(len(table), dtype=bool)
+        columns = {"observations": table.observations, "next_observations": table.next_observations}
+        columns = {name: values.astype(np.float32) for name, values in columns.items()}
+        rest = {"actions": table.actions.astype(np.float32), "rewards": table.rewards}
+        super().__init__({**columns, **rest, "terminations": none, "truncations": table.is_last}, table.name)
+
+
 def _check_numbers(tree: Any, name: str) -> None:
     for values in _arrays_of(tree):
         if values.dtype.kind not in "fiub":
@@ -285,7 +306,8 @@ def _check_numbers(tree: Any, name: str) -> None:
 def open_source(source: Any, download: bool = True, trusted: bool = False) -> Source:
     """
     :param source: The id of a Minari dataset, a ``minari.MinariDataset``, a replay buffer of SB3 or the path of a saved one
-        (``.npz``, ``.pkl``), or arrays: a mapping or the path of what ``numpy.savez`` wrote (``.npz``)
+        (``.npz``, ``.pkl``), arrays: a mapping or the path of what ``numpy.savez`` wrote (``.npz``), or a
+        :class:`~sb3_causalgdp.sources.tables.Table`
     :param download: Whether to download a Minari dataset that is not on this machine
     :param trusted: Whether a pickled buffer may hold more than what SB3's own are made of, which could run code
     :return: The source, of which no row has been read
@@ -297,9 +319,15 @@ def open_source(source: Any, download: bool = True, trusted: bool = False) -> So
         return source
     if isinstance(source, ReplayBuffer):
         return BufferSource(source)
+    if isinstance(source, Table):
+        return TableSource(source)
+    if is_frame(source):
+        raise ValueError(f"Of a table the columns are needed: {TABLE_HINT}")
     if isinstance(source, Mapping):
         return ArraySource(source)
     if isinstance(source, str | os.PathLike):
+        if Path(source).suffix.lower() in set(TABLE_SUFFIXES) - set(SUFFIXES):
+            raise ValueError(f"{source} is a table, whose columns are needed: {TABLE_HINT}")
         return _open_name(os.fspath(source), download, trusted)
     if hasattr(source, "iterate_episodes"):
         return MinariSource(source)

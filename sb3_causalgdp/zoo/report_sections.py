@@ -16,6 +16,7 @@ from sb3_causalgdp import CausalGDP
 from sb3_causalgdp.callbacks.diagnostics import step_divergences
 from sb3_causalgdp.callbacks.pictures import draw_transitions, plot_guidance_strength, policy_input
 from sb3_causalgdp.causal import CausalGraph
+from sb3_causalgdp.causal.description import count_of_edges
 from sb3_causalgdp.causal.plots import plot_causal_graph, plot_history
 from sb3_causalgdp.offline.saved_buffers import SUFFIXES, read_buffer
 from sb3_causalgdp.saving.archives import existing
@@ -181,7 +182,7 @@ def _summary_section(run: RunFolder, model: CausalGDP, kind: str, model_path: Pa
         rows.append(("Best evaluation", f"{_spread(evaluations.returns[best])} at {evaluations.steps[best]:,} steps"))
     if model._causal_graph is not None:
         graph = model.causal_graph()
-        rows.append(("Causal graph", f"{_n_edges(graph)} edges with a mask above 0.5, from {graph.n_samples:,} transitions"))
+        rows.append(("Causal graph", f"{count_of_edges(graph)}, from {graph.n_samples:,} transitions"))
     return Section("Summary", run.problems_with(".zip"), tables=[Table((), rows)])
 
 
@@ -258,16 +259,16 @@ def _graph_section(model: CausalGDP) -> Section:
         remarks.append(f"Are linear functions of each other, and share their masks: {', '.join(group)}.")
     remarks += [f"{remark}." for remark in graph.remarks]
     pictures = [
-        _picture(plot_causal_graph(graph, kind="heat_map"), "Masks, with the signs of the effects: a column causes a row."),
-        _picture(plot_causal_graph(graph, kind="graph"), "The same as a graph: from now, on the left, to the next state."),
+        _picture(plot_causal_graph(graph, kind="heat_map"), "Effects, in standard deviations: a column causes a row."),
+        _picture(plot_causal_graph(graph, kind="graph"), "The strongest causes of each effect: from now, on the left, on."),
     ]
-    edges = sorted((edge for edge in graph.edges() if edge.mask > 0.5), key=lambda edge: -abs(edge.strength))
+    edges = sorted(graph.edges(), key=lambda edge: -abs(edge.strength))
     rows = [(edge.cause, edge.effect, f"{edge.mask:.2f}", _strength(edge.strength, edge.standard_error)) for edge in edges]
     tables = [
         Table(
             ("cause", "effect", "mask", "strength"),
             rows[:MOST_EDGES],
-            f"The {min(MOST_EDGES, len(rows))} strongest of {len(rows)} edges with a mask above 0.5",
+            f"The {min(MOST_EDGES, len(rows))} strongest of {len(rows)} edges",
             folded=True,
         )
     ]
@@ -426,10 +427,6 @@ def _text(value: Any) -> str:
 
 def _moment(graph: CausalGraph) -> str:
     return "an unknown step" if graph.num_timesteps is None else f"step {graph.num_timesteps:,}"
-
-
-def _n_edges(graph: CausalGraph) -> int:
-    return int(np.count_nonzero(graph.masks > 0.5))
 
 
 def _some(observations: Observations, n_rows: int) -> Observations:

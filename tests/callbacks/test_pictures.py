@@ -170,3 +170,14 @@ def test_another_algorithm_is_refused(tmp_path):
     model = SAC("MlpPolicy", "Pendulum-v1", device="cpu", buffer_size=10, policy_kwargs={"net_arch": [4]})
     with pytest.raises(TypeError, match="CausalPicturesCallback draws a CausalGDP, got SAC"):
         model.learn(1, callback=CausalPicturesCallback(folder=tmp_path))
+
+
+def test_the_picture_of_the_graph_takes_a_view(tmp_path):
+    model = make()
+    callback = CausalPicturesCallback(60, tmp_path, kind="graph", view={"causes": 1, "size": (4.0, 3.0)})
+    model.learn(64, callback=[early(), callback])
+    assert imread(tmp_path / "graph_60_steps.png").shape[:2] == (360, 480)
+    with pytest.raises(ValueError, match="causes must be an integer of at least 1, got 0"):
+        CausalPicturesCallback(view={"causes": 0})
+    with pytest.raises(ValueError, match="kind must be one of"):
+        CausalPicturesCallback(kind="pie")

@@ -9,13 +9,14 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 from gymnasium.vector.utils import concatenate, create_empty_array
+from PIL import Image
 from stable_baselines3 import SAC
 from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer, RolloutBuffer
 from stable_baselines3.common.save_util import save_to_pkl
 from stable_baselines3.her import HerReplayBuffer
 
 import sb3_causalgdp
-from sb3_causalgdp.causal import CausalGraph
+from sb3_causalgdp.causal import CausalGraph, TransitionVariables
 from sb3_causalgdp.causal.__main__ import feed, main, parse_kwargs
 from sb3_causalgdp.causal.discovery import make_discovery, make_statistics
 from sb3_causalgdp.causal.sources import (
@@ -268,7 +269,7 @@ def test_summary(arrays, capsys):
     assert printed.err == ""
     for part in (
         f"{arrays}: 600 transitions\n",
-        "partial_r2: 4 of 9 possible edges have a mask above 0.5",
+        "partial_r2: 4 edges with a probability above 0.5 of 9, 4 expected\n",
         "   obs[0] -> obs[0]'\n",
         "   obs[1] -> obs[1]'\n",
         "action[0] -> obs[0]'\n",
@@ -309,7 +310,7 @@ def test_python_m(arrays):
     command = [sys.executable, "-m", "sb3_causalgdp.causal", str(arrays), "--method-kwargs", "threshold=0.05"]
     done = subprocess.run(command, env=env, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
-    assert "partial_r2: 4 of 9 possible edges" in done.stdout
+    assert "partial_r2: 4 edges with a probability above 0.5 of 9" in done.stdout
 
 
 @pytest.mark.parametrize("options", [["--window", "400"], ["--half-life", "50"], []])
@@ -378,13 +379,57 @@ def test_mistakes_in_the_source(tmp_path, capsys):
         ("missing", "no file"),
         ("broken.pkl", "broken.pkl cannot be read as a replay buffer: UnpicklingError"),
         ("broken.npz", "broken.npz cannot be read as arrays"),
-        ("table.csv", "table.csv is neither a saved replay buffer (.npz, .pkl) nor arrays (.npz)"),
+        ("table.csv", "table.csv is a table and needs --state, --action, --reward: its columns are 1, 2, 3"),
+        ("none.csv", "there is no file"),
         ("list.pkl", "list.pkl holds no replay buffer but a list"),
         ("rollout.pkl", "rollout.pkl holds no replay buffer but a RolloutBuffer"),
         ("empty.pkl", "empty.pkl holds no transitions"),
         ("half.npz", "half.npz lacks the arrays ['next_observations', 'rewards']"),
     ):
         assert message in error_of(capsys, tmp_path / name)
+
+
+def write_table(path, n_rows=300):
+    rng = np.random.default_rng(0)
+    level, valve = np.zeros(n_rows), rng.uniform(-1, 1, n_rows)
+    for t in range(1, n_rows):
+        level[t] = 0.8 * level[t - 1] + valve[t - 1] + 0.1 * rng.normal()
+    content = np.column_stack([np.arange(n_rows) // 100, np.arange(n_rows), level, valve, -(level**2)])
+    np.savetxt(path, content, "%.6f", ",", header="run,second,level,valve,cost", comments="")
+
+
+TABLE = ("--state", "level", "--action", "valve", "--reward", "cost")
+
+
+def test_a_table_is_read_by_the_names_of_its_columns(tmp_path, capsys):
+    write_table(tmp_path / "tank.csv")
+    main([str(tmp_path / "tank.csv"), *TABLE, "--episode", "run", "--time", "second", "--json", str(tmp_path / "graph.json")])
+    printed = capsys.readouterr()
+    assert printed.err == "" and "tank.csv: 297 transitions" in printed.out
+    assert "  valve -> level'\n" in printed.out
+    graph = CausalGraph.load(tmp_path / "graph.json")
+    assert graph.variables == TransitionVariables(("level",), ("valve",)) and graph.n_samples == 297
+    main([str(tmp_path / "tank.csv"), *TABLE, "--lag", "2", "--max-rows", "100"])
+    assert "100 of 298 transitions" in capsys.readouterr().out
+
+
+def test_what_is_missing_in_a_table_is_said(tmp_path, capsys):
+    write_table(tmp_path / "tank.csv")
+    text = (tmp_path / "tank.csv").read_text().splitlines()
+    (tmp_path / "tank.csv").write_text("\n".join([*text[:5], "0,4,,0.5,1", *text[6:]]))
+    assert "missing or infinite values, by column: 'level' 1" in error_of(capsys, tmp_path / "tank.csv", *TABLE)
+    main([str(tmp_path / "tank.csv"), *TABLE, "--drop-missing"])
+    assert "remark: 2 of 299 transitions left out for missing values, by column: 'level' 1" in capsys.readouterr().out
+
+
+def test_the_picture_takes_the_options_of_a_view(arrays, tmp_path, capsys):
+    command = [str(arrays), "--quiet", "--plot", str(tmp_path / "graph.png"), "--plot-kwargs"]
+    main([*command, "kind=heat_map", "values=masks", "size=[5, 4]"])
+    with Image.open(tmp_path / "graph.png") as image:
+        assert image.size == (600, 480)
+    for option, message in (("colour=red", "unknown options ['colour'] of a picture"), ("kind=pie", "kind must be one of")):
+        assert message in error_of(capsys, *command, option)
+    assert "--plot-kwargs need --plot FILE" in error_of(capsys, arrays, "--plot-kwargs", "causes=2")
 
 
 def test_minari_datasets_that_are_damaged(minari, capsys):

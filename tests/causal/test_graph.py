@@ -56,8 +56,9 @@ def test_unknown_standard_errors_are_an_error(block):
 
 def test_edges_have_names_masks_strengths_and_standard_errors():
     graph = make_full_graph()
-    assert graph.n_edges == 6
-    assert graph.edges() == [
+    assert graph.n_edges == len(graph.edges()) == 3
+    assert graph.expected_edges == pytest.approx(3.5)
+    assert graph.edges(0.0) == [
         ("x", "x'", 0.9, 1 / 3, 0.01),
         ("x", "y'", 0.5, -0.2, 0.04),
         ("y", "y'", 1.0, 2.0, 0.05),
@@ -65,14 +66,16 @@ def test_edges_have_names_masks_strengths_and_standard_errors():
         ("y'", "reward", 0.7, -0.4, 0.08),
         ("force", "reward", 0.3, 0.1, 0.09),
     ]
+    assert graph.edges() == [edge for edge in graph.edges(0.0) if edge.mask > 0.5]
     assert all(np.isnan(edge.standard_error) for edge in make_graph().edges())
 
 
 def test_networkx_graph_has_layers_and_open_edges_only():
-    network = make_graph().to_networkx()
+    network = make_graph().to_networkx(threshold=0.0)
     assert dict(network.nodes(data="layer")) == {"x": 0, "y": 0, "force": 0, "x'": 1, "y'": 1, "reward": 2}
     assert network.number_of_edges() == 6
     assert network.edges["x", "y'"] == {"mask": 0.5, "strength": -0.2}
+    assert make_graph().to_networkx().number_of_edges() == make_graph().n_edges == 3
     assert not network.has_edge("y", "x'")
 
 

@@ -8,6 +8,7 @@ import torch as th
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
+from sb3_causalgdp import causal
 from sb3_causalgdp.causal import MaskedWorldModel, StructuralModel, TransitionVariables
 from sb3_causalgdp.causal.plots.effects import plot_action_effects, plot_next_state_effects, plot_reward_effects
 
@@ -337,7 +338,9 @@ def test_a_dollar_sign_in_a_name_is_a_dollar_sign(tmp_path):
 
 
 def test_missing_matplotlib_says_what_to_install(monkeypatch, linear):
-    monkeypatch.delitem(sys.modules, "sb3_causalgdp.causal.plots.effects")
+    for name in [name for name in sys.modules if name.startswith("sb3_causalgdp.causal.plots")]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.delattr(causal, "plots")
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
     with pytest.raises(ImportError, match=r'pip install "sb3_causalgdp\[plots\]"'):
         linear.effect_of_actions(*draw()).plot()
@@ -517,3 +520,97 @@ def test_abduction_beats_prediction_on_a_pendulum_in_the_wind():
     replayed, predicted, replayed_reward, predicted_reward = np.mean(errors, axis=0)
     assert (replayed < 0.5 * predicted).all(), (replayed, predicted)
     assert replayed_reward[0] < 0.5 * predicted_reward[0], (replayed_reward, predicted_reward)
+
+
+# Tables and pictures of the answers -------------------------------------------------------------------------------------
+
+
+def test_an_intervention_is_told_by_name_beside_what_would_be_without(in_other_units):
+    state, action = np.array([1.0, -100.0, 0.0]), np.array([0.0, 5.0])
+    outcome, plain = (in_other_units.intervene(state, action, values) for values in ({"u": 2.0}, {}))
+    mean, std = outcome["x'"]
+    assert (mean, std) == (outcome.next_state[0], outcome.next_state_std[0])
+    assert outcome["reward"] == (outcome.reward, outcome.reward_std)
+    with pytest.raises(KeyError, match="unknown outcome"):
+        outcome["w"]
+    assert len([*outcome]) == 4 and outcome[2] == outcome.reward
+    frame = outcome.to_dataframe().set_index("outcome")
+    assert list(frame.index) == ["x'", "y'", "z'", "reward"]
+    np.testing.assert_allclose(frame["without"], [*plain.next_state, plain.reward])
+    np.testing.assert_allclose(frame["change"], frame["mean"] - frame["without"])
+    # u = 2 is half of its range: B u in the model's units, times the scales 2, 10 and 0.1
+    np.testing.assert_allclose(frame["change"][:3], [0.5 * 2.0, -0.3 * 10.0, 0.0], atol=1e-2)
+    np.testing.assert_allclose(frame["standardised_change"] * outcome.running_std, frame["change"])
+    assert abs(frame["standardised_change"]["y'"] - frame["change"]["y'"]) > 1.0
+    assert plain.without is None and (plain.to_dataframe()["change"] == 0.0).all()
+
+
+def test_a_batch_has_rows_for_each_observation(linear):
+    states, actions = draw(4)
+    frame = linear.intervene(states, actions, {"v": 1.0}).to_dataframe()
+    assert len(frame) == 16 and frame["observation"].nunique() == 4
+
+
+def test_effects_are_a_table_that_says_its_units(in_other_units):
+    states = np.tile([1.0, -100.0, 0.0], (5, 1))
+    effects = in_other_units.effect_of_actions(states, np.tile([0.0, 5.0], (5, 1)))
+    raw, standard = effects.to_dataframe(), effects.standardised().to_dataframe()
+    assert len(raw) == 2 * (3 + 3)
+    row = raw[(raw.action == "u") & (raw.outcome == "y'")].iloc[0]
+    np.testing.assert_allclose(row["mean"], effects.next_state.mean[1, 0])
+    assert row.unit != standard.unit[0] and not np.allclose(raw["mean"], standard["mean"])
+    direct, through, total = (raw[(raw.action == "v") & (raw.part == part)]["mean"].iloc[0] for part in PARTS)
+    np.testing.assert_allclose(direct + through, total)
+
+
+PARTS = ("direct", "through the next state", "total")
+
+
+def test_a_counterfactual_is_a_table_with_and_without(linear):
+    recorded = linear_trajectory()
+    answer = linear.counterfactual(recorded, {"u": -0.4})
+    frame = answer.to_dataframe()
+    n_steps = len(recorded[1])
+    assert len(frame) == 3 * (n_steps + 1) + 2 * n_steps + n_steps
+    x = frame[frame.variable == "x"]
+    np.testing.assert_array_equal(x["recorded"], recorded[0][:, 0])
+    np.testing.assert_array_equal(x["counterfactual"], answer.states[:, 0])
+    np.testing.assert_allclose(x["standardised_change"] * answer.running_std[0], x["change"])
+    assert (frame[frame.variable == "v"]["change"] == 0.0).all()
+
+
+def test_a_counterfactual_is_drawn_with_and_without_and_a_band_where_they_differ(linear, tmp_path):
+    recorded = linear_trajectory()
+    changed = recorded[1][:, 0].copy()
+    changed[10:] = -0.4
+    answer = linear.counterfactual(recorded, {"u": changed})
+    figure = answer.plot(tmp_path / "answer.png")
+    assert (tmp_path / "answer.png").stat().st_size > 5_000
+    panels = {axes.get_ylabel(): axes for axes in figure.axes}
+    assert "reward" in panels and "u" in panels and "v" not in panels
+    before, after = panels["x"].lines
+    np.testing.assert_array_equal(before.get_ydata(), recorded[0][:, 0])
+    np.testing.assert_array_equal(after.get_ydata(), answer.states[:, 0])
+    band = panels["x"].collections[0].get_paths()[0].vertices
+    widths = [np.ptp(band[band[:, 0] == step, 1]) for step in (5, 20)]
+    np.testing.assert_allclose(widths, [0.0, 4 * answer.noise_std[0]], atol=1e-9)
+    assert list(axes.get_ylabel() for axes in answer.plot(variables=["z", "v"]).axes) == ["z", "v"]
+    for arguments, message in (
+        ({"variables": ["w"]}, r"variables must be some of .* got \['w'\]"),
+        ({"max_variables": 0}, "max_variables"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            answer.plot(**arguments)
+
+
+def test_an_intervention_is_drawn_with_and_without(in_other_units, tmp_path):
+    outcome = in_other_units.intervene(np.array([1.0, -100.0, 0.0]), np.array([0.0, 5.0]), {"u": 2.0})
+    (axes,) = outcome.plot(tmp_path / "outcome.png").axes
+    without, with_it = axes.lines[:2]
+    assert (np.asarray(without.get_xdata()) == 0.0).all()
+    np.testing.assert_allclose(with_it.get_xdata(), outcome.to_dataframe()["standardised_change"])
+    assert [text.get_text() for text in axes.get_yticklabels()] == ["x'", "y'", "z'", "reward"]
+    (axes,) = outcome.plot(max_outcomes=2).axes
+    assert len(axes.get_yticks()) == 2 and "(the 2 of 4 outcomes that change most)" in axes.get_title()
+    with pytest.raises(ValueError, match="max_outcomes must be at least 1"):
+        outcome.plot(max_outcomes=0)

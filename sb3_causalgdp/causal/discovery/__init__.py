@@ -2,8 +2,9 @@
 
 import inspect
 import math
-from collections.abc import Callable
-from typing import Any, Protocol
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any, Protocol, overload
 
 import numpy.typing as npt
 
@@ -15,6 +16,7 @@ from sb3_causalgdp.causal.discovery.world_model import WorldModelEffects
 from sb3_causalgdp.causal.graph import CausalGraph
 from sb3_causalgdp.causal.statistics.moments import StreamingMoments
 from sb3_causalgdp.causal.variables import TransitionVariables
+from sb3_causalgdp.sources.tables import Table
 
 __all__ = [
     "DISCOVERY_METHODS",
@@ -120,18 +122,60 @@ def min_rows(method: DiscoveryMethod, variables: TransitionVariables) -> int:
     return method.min_rows(variables) if hasattr(method, "min_rows") else 1
 
 
+@overload
 def discover(
     method: str | Callable[..., CausalGraph], rows: npt.ArrayLike, variables: TransitionVariables, /, **kwargs: Any
+) -> CausalGraph: ...
+
+
+@overload
+def discover(
+    table: Any,
+    /,
+    *,
+    states: Sequence[str] = ...,
+    actions: Sequence[str] = ...,
+    reward: str = ...,
+    method: str | Callable[..., CausalGraph] = ...,
+    **kwargs: Any,
+) -> CausalGraph: ...
+
+
+def discover(
+    source: Any, rows: npt.ArrayLike | None = None, variables: TransitionVariables | None = None, /, **kwargs: Any
 ) -> CausalGraph:
     """
-    Find the graph of recorded transitions, in one call.
+    Find the graph of recorded transitions, in one call: ``discover("partial_r2", rows, variables)`` with rows
+    ``[s, a, s', r]`` (see :meth:`TransitionVariables.stack`, shape (N, 2 n + d + 1)), or of a table whose columns are named,
+    ``discover(frame, states=["level"], actions=["valve"], reward="cost")``.
 
-    :param method: A key of ``DISCOVERY_METHODS``, or a callable
-    :param rows: Transitions ``[s, a, s', r]``, see :meth:`TransitionVariables.stack`, shape (N, 2 n + d + 1)
+    :param source: The name of a method (a key of ``DISCOVERY_METHODS``) or a callable, with rows; or a table: a data frame, an
+        Arrow table, a mapping of arrays, the path of a file, or a :class:`~sb3_causalgdp.sources.tables.Table`
+    :param rows: Transitions, shape (N, 2 n + d + 1)
     :param variables: Names and order of the variables
-    :param kwargs: Arguments of the method's constructor
+    :param kwargs: Arguments of the method's constructor; with a table also those of
+        :class:`~sb3_causalgdp.sources.tables.Table`, and ``method`` (``"partial_r2"``)
     :return: the graph
+    :raises ValueError: on an unknown argument, or a table that cannot be used
     """
+    if rows is not None and variables is not None:
+        return _discover(source, rows, variables, kwargs)
+    own = [name for name in inspect.signature(Table).parameters if name in kwargs]
+    method = kwargs.pop("method", "partial_r2")
+    if not isinstance(source, Table):
+        needed = [name for name in ("states", "actions", "reward") if name not in own]
+        if needed:
+            raise ValueError(f"of a table the columns are needed, as states=, actions= and reward=; missing are {needed}")
+        source = Table(source, **{name: kwargs.pop(name) for name in own})
+    variables = TransitionVariables(source.state_names, source.action_names)
+    rows = variables.stack(source.observations, source.actions, source.next_observations, source.rewards)
+    graph = _discover(method, rows, variables, kwargs)
+    return replace(graph, remarks=(*graph.remarks, *source.remarks))
+
+
+def _discover(
+    method: str | Callable[..., CausalGraph], rows: npt.ArrayLike, variables: TransitionVariables, kwargs: dict[str, Any]
+) -> CausalGraph:
     chosen = make_discovery(method, **kwargs)
     statistics = make_statistics(chosen, variables)
     statistics.update(rows)

@@ -2,8 +2,8 @@ import os
 
 import numpy as np
 
-from sb3_causalgdp.causal.graph import PLOTS_HINT
-from sb3_causalgdp.causal.interventions import ActionEffects
+from sb3_causalgdp.causal.answers import ActionEffects
+from sb3_causalgdp.causal.drawing import PLOTS_HINT
 from sb3_causalgdp.causal.plots.figures import AS_TEXT, FONT_SIZE, INCHES_PER_CHARACTER, save_figure
 
 try:

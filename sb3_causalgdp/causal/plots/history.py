@@ -4,22 +4,26 @@ import os
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 
+from sb3_causalgdp.causal.description import count_of_edges
+from sb3_causalgdp.causal.edges import EDGE_PROBABILITY
 from sb3_causalgdp.causal.graph import PLOTS_HINT, CausalGraph
-from sb3_causalgdp.causal.plots.figures import FONT_SIZE, check_choice, check_suffix, save_figure
+from sb3_causalgdp.causal.plots.figures import FONT_SIZE, check_suffix, save_figure
 from sb3_causalgdp.causal.plots.heat_maps import (
-    VALUES,
     draw_matrix,
     heat_map_size,
     largest_value,
     matrix_of,
     name_causes,
     name_effects,
+    opacity_of,
     scale_label,
 )
-from sb3_causalgdp.causal.plots.summary import Groups, Summary, summarize
+from sb3_causalgdp.causal.plots.summary import Summary
+from sb3_causalgdp.causal.plots.view import View, view_of
 from sb3_causalgdp.causal.variables import TransitionVariables
 from sb3_causalgdp.files import replaced_when_done
 
@@ -37,13 +41,10 @@ GIF_DPI = 80
 def plot_history(
     graphs: Sequence[CausalGraph],
     path: str | os.PathLike[str] | None = None,
-    max_variables: int = 40,
+    view: View | None = None,
     *,
     max_panels: int = 8,
-    threshold: float = 0.5,
-    values: str = "masks",
-    groups: Groups = "auto",
-    aggregate: str = "mean",
+    **options: Any,
 ) -> Figure:
     """
     Draw how the graph changed over training: heat maps of some of the graphs, evenly chosen, on one colour scale, and beside
@@ -51,33 +52,30 @@ def plot_history(
 
     :param graphs: Graphs over the same variables, oldest first, at least one
     :param path: Image file to write, by its suffix; its folder is created; None writes nothing
-    :param max_variables: More states and actions than this are summarised, see ``groups``
+    :param view: What is drawn
     :param max_panels: Draw at most this many heat maps, from 1 to 8; two or more show the first and the last graph
-    :param threshold: Masks above it are counted as edges, in [0, 1)
-    :param values: What the colours are: ``"masks"``, with the signs of the effects, or ``"effects"``
-    :param groups: How to summarise, see :func:`~sb3_causalgdp.causal.plots.summary.summarize`
-    :param aggregate: ``"mean"`` or ``"max"`` of a group's entries
+    :param options: Fields of the view by name
     :return: the figure
     :raises ValueError: on an argument out of range, graphs over different variables, or a suffix that is not an image's
     """
-    check_choice("values", values, VALUES)
+    view = view_of(view, options)
     check_suffix(path)
     if not 1 <= max_panels <= 8:
         raise ValueError(f"max_panels must be from 1 to 8, got {max_panels!r}")
-    _check_threshold(threshold)
-    summary = _summary_of_history(graphs, max_variables, groups, aggregate)
+    summary = _summary_of_history(graphs, view)
     n_panels = min(max_panels, len(graphs))
     chosen = np.linspace(len(graphs) - 1, 0, n_panels).round().astype(int)[::-1]
     panels = [(_moment(graphs, number), summary(graphs[number])) for number in chosen]
     n_rows = 1 if n_panels <= 4 else 2
     n_columns = -(-n_panels // n_rows)
     width, height = _panel_size(summary.variables)
-    figure = Figure(figsize=(n_columns * width + 5.0, max(4.4, n_rows * height + 0.8)), layout="constrained")
+    size = view.size_or(n_columns * width + 5.0, max(4.4, n_rows * height + 0.8))
+    figure = Figure(figsize=size, layout="constrained")
     maps, curves = figure.subfigures(1, 2, squeeze=False, width_ratios=(n_columns * width + 0.6, 4.4))[0]
-    _draw_panels(panels, maps, n_rows, n_columns, values, summary)
-    _draw_curves(graphs, curves, threshold)
+    _draw_panels(panels, maps, n_rows, n_columns, view, summary)
+    _draw_curves(graphs, curves)
     remark = f" ({summary.remark})" if summary.remark else ""
-    maps.suptitle(f"Causal {values} over training{remark}", fontsize=FONT_SIZE + 2)
+    maps.suptitle(f"Causal {view.values} over training{remark}", fontsize=FONT_SIZE + 2)
     save_figure(figure, path)
     return figure
 
@@ -85,50 +83,44 @@ def plot_history(
 def animate_history(
     graphs: Sequence[CausalGraph],
     path: str | os.PathLike[str],
-    max_variables: int = 40,
+    view: View | None = None,
     *,
     frames_per_second: float = 2.0,
-    threshold: float = 0.5,
-    values: str = "masks",
-    groups: Groups = "auto",
-    aggregate: str = "mean",
+    **options: Any,
 ) -> None:
     """
     Write the graphs as an animated heat map, a frame for each, on one colour scale; the last one stays for two seconds.
 
     :param graphs: Graphs over the same variables, oldest first, at least one
     :param path: GIF to write; its folder is created
-    :param max_variables: More states and actions than this are summarised, see ``groups``
+    :param view: What is drawn
     :param frames_per_second: Speed, above 0 and at most 50
-    :param threshold: Masks above it are counted as edges, in [0, 1)
-    :param values: What the colours are: ``"masks"``, with the signs of the effects, or ``"effects"``
-    :param groups: How to summarise, see :func:`~sb3_causalgdp.causal.plots.summary.summarize`
-    :param aggregate: ``"mean"`` or ``"max"`` of a group's entries
+    :param options: Fields of the view by name
     :raises ValueError: on an argument out of range, graphs over different variables, or another suffix
     """
-    check_choice("values", values, VALUES)
-    _check_threshold(threshold)
+    view = view_of(view, options)
     if os.path.splitext(path)[1].lower() != ".gif":
         raise ValueError(f"path must end in .gif, got {os.fspath(path)!r}")
     if not 0 < frames_per_second <= 50:
         raise ValueError(f"frames_per_second must be above 0 and at most 50, got {frames_per_second!r}")
-    summary = _summary_of_history(graphs, max_variables, groups, aggregate)
+    summary = _summary_of_history(graphs, view)
     frames = [summary(graph) for graph in graphs]
-    figure = Figure(figsize=heat_map_size(summary.variables), layout="constrained")
+    figure = Figure(figsize=view.size_or(*heat_map_size(summary.variables)), layout="constrained")
     canvas = FigureCanvasAgg(figure)
     figure.set_dpi(GIF_DPI)
     axes = figure.add_subplot()
-    largest = largest_value(frames, values, summary.is_grouped)
-    image = draw_matrix(frames[0], axes, values, summary.is_grouped, largest)
+    largest = largest_value(frames, view, summary.is_grouped)
+    image = draw_matrix(frames[0], axes, view, summary.is_grouped, largest)
     name_causes(summary.variables, axes)
     name_effects(summary.variables, axes)
     axes.set_xlabel("cause")
     axes.set_ylabel("effect")
-    figure.colorbar(image, ax=axes, fraction=0.04, pad=0.02).set_label(scale_label(values, summary))
+    figure.colorbar(image, ax=axes, fraction=0.04, pad=0.02).set_label(scale_label(view, summary))
     pictures = []
     for number, (graph, frame) in enumerate(zip(graphs, frames, strict=True)):
-        image.set_data(matrix_of(frame, values, summary.is_grouped))
-        axes.set_title(f"{_moment(graphs, number)}: {_count(graph, threshold)} edges", fontsize=FONT_SIZE + 2)
+        image.set_data(matrix_of(frame, view, summary.is_grouped))
+        image.set_alpha(opacity_of(frame, view, summary.is_grouped))
+        axes.set_title(f"{_moment(graphs, number)}: {count_of_edges(graph)}", fontsize=FONT_SIZE + 2)
         canvas.draw()
         # All frames keep the layout of the first
         figure.set_layout_engine("none")
@@ -138,48 +130,50 @@ def animate_history(
         pictures[0].save(temporary, format="GIF", save_all=True, append_images=pictures[1:], duration=milliseconds, loop=0)
 
 
-def _summary_of_history(graphs: Sequence[CausalGraph], max_variables: int, groups: Groups, aggregate: str) -> Summary:
+def _summary_of_history(graphs: Sequence[CausalGraph], view: View) -> Summary:
     """One choice of variables for all graphs, by their mean masks."""
     if len(graphs) == 0:
         raise ValueError("graphs is empty: at least one is needed")
     if any(graph.variables != graphs[0].variables for graph in graphs):
         raise ValueError("graphs must be over the same variables")
     mean = replace(graphs[0], masks=np.mean([graph.masks for graph in graphs], axis=0))
-    return summarize(mean, max_variables, groups, aggregate)
+    return view.summary_of(mean)
 
 
 def _draw_panels(
-    panels: Sequence[tuple[str, CausalGraph]], figure: SubFigure, n_rows: int, n_columns: int, values: str, summary: Summary
+    panels: Sequence[tuple[str, CausalGraph]], figure: SubFigure, n_rows: int, n_columns: int, view: View, summary: Summary
 ) -> None:
     """Heat maps under their titles, with names at the left and at the bottom."""
     all_axes = figure.subplots(n_rows, n_columns, squeeze=False)
-    largest = largest_value([shown for _, shown in panels], values, summary.is_grouped)
+    largest = largest_value([shown for _, shown in panels], view, summary.is_grouped)
     for number, axes in enumerate(all_axes.flat):
         if number >= len(panels):
             axes.set_axis_off()
             continue
         title, shown = panels[number]
-        image = draw_matrix(shown, axes, values, summary.is_grouped, largest)
+        image = draw_matrix(shown, axes, view, summary.is_grouped, largest)
         if number % n_columns == 0:
             name_effects(summary.variables, axes, FONT_SIZE - 2)
         if number + n_columns >= len(panels):
             name_causes(summary.variables, axes, FONT_SIZE - 2)
         axes.set_title(title, fontsize=FONT_SIZE)
     bar = figure.colorbar(image, ax=all_axes, fraction=0.03, pad=0.02)
-    bar.set_label(scale_label(values, summary), fontsize=FONT_SIZE)
+    bar.set_label(scale_label(view, summary), fontsize=FONT_SIZE)
     bar.ax.tick_params(labelsize=FONT_SIZE - 1)
     figure.supxlabel("cause", fontsize=FONT_SIZE)
     figure.supylabel("effect", fontsize=FONT_SIZE)
 
 
-def _draw_curves(graphs: Sequence[CausalGraph], figure: SubFigure, threshold: float) -> None:
+def _draw_curves(graphs: Sequence[CausalGraph], figure: SubFigure) -> None:
     has_steps = _has_steps(graphs)
     at = [graph.num_timesteps if has_steps else number + 1 for number, graph in enumerate(graphs)]
     changes = [now.change_since(before) for before, now in pairwise(graphs)]
     upper, lower = figure.subplots(2, 1, sharex=True)
-    counts = [_count(graph, threshold) for graph in graphs]
-    upper.plot(at, counts, color="black", marker=".")
-    upper.set_title(f"edges (mask > {threshold:g})", fontsize=FONT_SIZE)
+    counts = [graph.n_edges for graph in graphs]
+    upper.plot(at, counts, color="black", marker=".", label=f"with a probability above {EDGE_PROBABILITY:g}")
+    upper.plot(at, [graph.expected_edges for graph in graphs], color="0.6", linestyle="--", label="expected")
+    upper.set_title("edges", fontsize=FONT_SIZE)
+    upper.legend(frameon=False, fontsize=FONT_SIZE - 1, loc="lower right")
     lower.plot(at[1:], changes, color="black", marker=".")
     lower.set_title("mean change of a mask since the graph before", fontsize=FONT_SIZE)
     lower.set_xlabel("environment steps" if has_steps else "number of the graph", fontsize=FONT_SIZE)
@@ -204,16 +198,7 @@ def _moment(graphs: Sequence[CausalGraph], number: int) -> str:
     return f"graph {number + 1} of {len(graphs)}" if steps is None else f"{steps:,} steps"
 
 
-def _count(graph: CausalGraph, threshold: float) -> int:
-    return int(np.count_nonzero(graph.masks > threshold))
-
-
 def _panel_size(variables: TransitionVariables) -> tuple[float, float]:
     """Width and height of one heat map in the history, in inches."""
     cell = 0.14
     return max(1.9, cell * (variables.n_states + variables.n_actions)), max(1.9, cell * (variables.n_states + 1) + 0.4)
-
-
-def _check_threshold(threshold: float) -> None:
-    if not 0 <= threshold < 1:
-        raise ValueError(f"threshold must be in [0, 1), got {threshold!r}")

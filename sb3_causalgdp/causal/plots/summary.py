@@ -1,21 +1,19 @@
 """A small graph that stands for a large one: groups of variables, or the variables with the most edges."""
 
-import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import groupby
 from typing import Any, Literal
 
 import numpy as np
 
+from sb3_causalgdp.causal.edges import certain_sizes
 from sb3_causalgdp.causal.graph import CausalGraph
+from sb3_causalgdp.causal.plots.grouping import groups_of_names
 from sb3_causalgdp.causal.variables import TransitionVariables
 
 Groups = Mapping[str, str] | Mapping[str, int] | Literal["auto", "names"] | None
 
 AGGREGATES: dict[str, Callable[[np.ndarray], Any]] = {"mean": np.mean, "max": np.max}
-MAX_GROUPS = 20  # of the states, and of the actions, where they are made from names
-GROUP_SIZES = [size * power for power in (1, 10, 100, 1_000, 10_000) for size in (1, 2, 5)]
 
 
 @dataclass(frozen=True)
@@ -36,7 +34,7 @@ class Summary:
 
     @property
     def is_grouped(self) -> bool:
-        """Whether a group has more than one variable: then effects have lost their signs and standard errors."""
+        """Whether a group has more than one variable: then effects are what is sure of their sizes."""
         return any(len(columns) > 1 for columns in self.members)
 
     def __call__(self, graph: CausalGraph) -> CausalGraph:
@@ -44,7 +42,9 @@ class Summary:
         :param graph: The large graph
         :return: the small one
         """
-        effects = np.abs(graph.effects) if self.is_grouped else graph.effects
+        effects = graph.effects
+        if self.is_grouped:
+            effects = graph.masks * certain_sizes(graph.effects, graph.standard_errors)
         errors = None if self.is_grouped or graph.standard_errors is None else self._aggregated(graph.standard_errors)
         return CausalGraph(
             self.variables,
@@ -72,8 +72,8 @@ def summarize(graph: CausalGraph, max_variables: int = 40, groups: Groups = "aut
     :param max_variables: Number of states and actions that can be read one by one, at least 2
     :param groups: What to draw in place of the single variables:
 
-        - ``"auto"`` groups more variables than ``max_variables`` by their names: neighbours with a common stem, such as
-          ``obs[0]`` to ``obs[19]``; ``"names"`` does so for any number of variables;
+        - ``"auto"`` groups more variables than ``max_variables`` by their names: neighbours that begin with the same words,
+          such as one key, body or joint, and ranges such as ``obs[0..19]``; ``"names"`` does so for any number of variables;
         - None does not group: of more variables than ``max_variables``, those with the largest total mask are shown;
         - a mapping from names of variables to names of groups; variables that it lacks stay alone;
         - a mapping from names of sections to numbers of consecutive states, such as
@@ -96,7 +96,7 @@ def summarize(graph: CausalGraph, max_variables: int = 40, groups: Groups = "aut
         return Summary(variables, tuple((i,) for i in range(n_variables)), aggregate)
     if groups is None:
         return _most_connected(graph, max_variables)
-    by_name = _groups_by_stem(variables.state_names) | _groups_by_stem(variables.action_names)
+    by_name = groups_of_names(variables.state_names) | groups_of_names(variables.action_names)
     return _summary_of_groups(variables, by_name, aggregate)
 
 
@@ -134,36 +134,7 @@ def _named_groups(variables: TransitionVariables, groups: Mapping[str, str] | Ma
     if sum(sections.values()) != variables.n_states:
         raise ValueError(f"the sections in groups must have {variables.n_states} states in all, got {sections}")
     repeated = [section for section, size in sections.items() for _ in range(size)]
-    return dict(zip(variables.state_names, repeated, strict=True)) | _groups_by_stem(variables.action_names)
-
-
-def _groups_by_stem(names: Sequence[str]) -> dict[str, str]:
-    """Neighbours with a common stem together, in ranges of a round size, the smallest that gives ``MAX_GROUPS`` or fewer."""
-    runs = [list(run) for _, run in groupby(names, key=_stem)]
-    if len(runs) > MAX_GROUPS:
-        runs = [list(names)]
-    for size in GROUP_SIZES:
-        ranges = [run[first : first + size] for run in runs for first in range(0, len(run), size)]
-        if len(ranges) <= MAX_GROUPS:
-            break
-    return {name: _name_of_range(members) for members in ranges for name in members}
-
-
-def _stem(name: str) -> str:
-    """The name without the number at its end: ``obs`` for ``obs[12]``."""
-    return re.sub(r"[\[_ ]?\d+\]?$", "", name)
-
-
-def _name_of_range(names: Sequence[str]) -> str:
-    """``obs[0..19]`` for ``obs[0]`` to ``obs[19]``."""
-    first, last = names[0], names[-1]
-    if len(names) == 1:
-        return first
-    stem = _stem(first)
-    if stem != _stem(last):
-        return f"{first}..{last}"
-    opening = first[len(stem) :].rstrip("]")
-    return f"{stem}{opening}..{re.sub(r'^[^0-9]*', '', last[len(stem) :])}"
+    return dict(zip(variables.state_names, repeated, strict=True)) | groups_of_names(variables.action_names)
 
 
 def _most_connected(graph: CausalGraph, max_variables: int) -> Summary:

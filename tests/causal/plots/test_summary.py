@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from sb3_causalgdp.causal import CausalGraph, TransitionVariables
-from sb3_causalgdp.causal.plots.summary import MAX_GROUPS, summarize
+from sb3_causalgdp.causal.plots.grouping import MAX_GROUPS
+from sb3_causalgdp.causal.plots.summary import summarize
 
 VARIABLES = TransitionVariables(("arm[0]", "arm[1]", "leg[0]"), ("force",))
 MASKS = np.array([[0.8, 0.4, 0.0, 0.1], [0.2, 0.6, 0.0, 0.3], [0.0, 0.0, 1.0, 0.0], [0.0, 0.5, 0.0, 0.9]])
@@ -29,11 +30,15 @@ def test_small_graphs_stay_as_they_are():
 @pytest.mark.parametrize(
     ("aggregate", "masks", "effects"),
     [
-        ("mean", [[0.5, 0.0, 0.2], [0.0, 1.0, 0.0], [0.25, 0.0, 0.9]], [[0.5, 0.0, 0.2], [0.0, 1.0, 0.0], [0.25, 0.0, 0.9]]),
-        ("max", [[0.8, 0.0, 0.3], [0.0, 1.0, 0.0], [0.5, 0.0, 0.9]], [[0.8, 0.0, 0.3], [0.0, 1.0, 0.0], [0.5, 0.0, 0.9]]),
+        (
+            "mean",
+            [[0.5, 0.0, 0.2], [0.0, 1.0, 0.0], [0.25, 0.0, 0.9]],
+            [[0.2, 0.0, 0.015], [0.0, 0.8, 0.0], [0.075, 0.0, 0.63]],
+        ),
+        ("max", [[0.8, 0.0, 0.3], [0.0, 1.0, 0.0], [0.5, 0.0, 0.9]], [[0.48, 0.0, 0.03], [0.0, 0.8, 0.0], [0.15, 0.0, 0.63]]),
     ],
 )
-def test_groups_have_the_mean_or_the_largest_of_their_entries(aggregate, masks, effects):
+def test_groups_have_the_mean_or_the_largest_of_their_masks_and_of_what_is_sure_of_their_effects(aggregate, masks, effects):
     summary = summarize(make_graph(), groups={"arm[0]": "arm", "arm[1]": "arm"}, aggregate=aggregate)
     small = summary(make_graph())
     assert small.variables == TransitionVariables(("arm", "leg[0]"), ("force",))
@@ -77,6 +82,30 @@ def test_names_without_numbers_are_grouped_by_their_ends():
     names = tuple(f"{a}{b}" for a in "abcdefg" for b in "uvwxyz")
     graph = CausalGraph.fully_connected(TransitionVariables(names, ("force",)))
     assert summarize(graph).variables.state_names[0] == "au..ay"
+
+
+def test_neighbours_that_begin_with_the_same_words_are_one_group_and_the_largest_are_split_first():
+    joints = ("hip", "knee")
+    names = [
+        *(f"{joint}_{leg}" for leg in range(4) for joint in joints),
+        *(f"vel {joint}_{leg}" for leg in range(4) for joint in joints),
+    ]
+    names += [f"force {body}[{i}]" for body in range(30) for i in range(6)]
+    graph = CausalGraph.fully_connected(TransitionVariables(tuple(names), ("torque",)))
+    shown = summarize(graph).variables.state_names
+    assert shown == (*names[:16], "180 force")
+
+
+def test_groups_that_begin_alike_have_names_of_their_own():
+    names = tuple(
+        f"{side} {joint} {axis}" for joint in ("hip", "arm") for side in ("left", "right") for axis in "abcdefghijklmnopqr"
+    )
+    shown = summarize(CausalGraph.fully_connected(TransitionVariables(names, ("torque",)))).variables.state_names
+    assert shown == ("18 left hip", "18 right hip", "18 left arm", "18 right arm")
+    crossed = tuple(f"{side} x{i}y" for i in range(30) for side in ("left", "right"))
+    assert (
+        len(set(summarize(CausalGraph.fully_connected(TransitionVariables(crossed, ("torque",)))).variables.state_names)) <= 20
+    )
 
 
 def test_sections_are_consecutive_states():

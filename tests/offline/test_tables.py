@@ -1,0 +1,71 @@
+import numpy as np
+import pandas as pd
+import pytest
+from gymnasium import spaces
+
+from sb3_causalgdp import CausalGDP
+from sb3_causalgdp.sources.tables import Table
+
+ROLES = {"states": ["level", "temperature"], "actions": ["valve"], "reward": "cost", "episode": "run"}
+
+
+def make_frame(n_episodes=10, n_steps=40):
+    rng = np.random.default_rng(0)
+    runs = np.repeat(np.arange(n_episodes), n_steps)
+    columns = rng.normal(size=(n_episodes * n_steps, 3))
+    valve = rng.uniform(0, 5, size=len(runs))
+    return pd.DataFrame({"run": runs, "level": columns[:, 0], "temperature": columns[:, 1], "valve": valve, "cost": -valve})
+
+
+def make(source, **kwargs):
+    return CausalGDP.from_dataset(source, buffer_size=2_000, **kwargs)
+
+
+def test_a_model_is_made_from_a_frame_and_learns_from_it():
+    frame = make_frame()
+    with pytest.warns(UserWarning, match=r"spaces are inferred, observation_space=Box\(-inf, inf, \(2,\).*action_space=Box\("):
+        model = make(frame, **ROLES)
+    assert model.observation_space.shape == (2,)
+    np.testing.assert_allclose(model.action_space.high, [frame["valve"].max()], rtol=1e-6)
+    table = Table(frame, **ROLES)
+    model.preload(table)
+    buffer = model.replay_buffer
+    assert buffer.size() == len(table) == 390
+    np.testing.assert_allclose(buffer.observations[:390, 0], table.observations, rtol=1e-6)
+    np.testing.assert_allclose(buffer.next_observations[:390, 0], table.next_observations, rtol=1e-6)
+    assert (buffer.dones[:390, 0] == table.is_last).all() and buffer.timeouts[:390].sum() == 10
+    model.pretrain(2)
+    action, _ = model.predict(np.zeros(2, dtype=np.float32))
+    assert model.action_space.contains(action)
+
+
+def test_given_spaces_are_taken_without_a_word(recwarn):
+    wanted = spaces.Box(-10.0, 10.0, (2,)), spaces.Box(0.0, 10.0, (1,))
+    model = make(make_frame(), **ROLES, observation_space=wanted[0], action_space=wanted[1])
+    assert (model.observation_space, model.action_space) == wanted
+    assert not [warning for warning in recwarn if "inferred" in str(warning.message)]
+
+
+def test_arrays_tell_their_shapes():
+    rng = np.random.default_rng(0)
+    arrays = {
+        "observations": rng.normal(size=(50, 3)),
+        "next_observations": rng.normal(size=(50, 3)),
+        "actions": rng.uniform(-2, 2, size=(50, 2)),
+        "rewards": rng.normal(size=50),
+        "terminations": np.zeros(50, bool),
+        "truncations": np.zeros(50, bool),
+    }
+    with pytest.warns(UserWarning, match=r"The arrays: spaces are inferred, observation_space=Box\(-inf, inf, \(3,\)"):
+        model = make(arrays)
+    assert model.observation_space.shape == (3,) and model.action_space.shape == (2,)
+    arrays["actions"][:, 0] = 1.0
+    with pytest.raises(ValueError, match="no range can be inferred, give action_space="):
+        make(arrays)
+
+
+def test_a_frame_without_roles_says_what_is_needed(tmp_path):
+    make_frame().to_csv(tmp_path / "tank.csv")
+    for source in (make_frame(), str(tmp_path / "tank.csv")):
+        with pytest.raises(ValueError, match=r"columns are needed: Table\(source, states="):
+            make(source)
