@@ -1,7 +1,6 @@
 """Networks that predict the noise in an action."""
 
 import math
-from collections.abc import Callable
 from itertools import pairwise
 
 import torch as th
@@ -9,6 +8,8 @@ from torch import nn
 
 from sb3_causalgdp.acceleration.activations import fast
 from sb3_causalgdp.acceleration.products import Linear, linear
+from sb3_causalgdp.diffusion.guidance import NoisePredictor
+from sb3_causalgdp.diffusion.schedules import at_step
 
 
 def sinusoidal_embedding(n_steps: int, dimension: int) -> th.Tensor:
@@ -65,7 +66,7 @@ class MLPDenoiser(nn.Module):
             layers += [fast(activation_fn)(), Linear(inputs, outputs)]
         self.network = nn.Sequential(*layers)
 
-    def bind(self, condition: th.Tensor) -> Callable[[th.Tensor, int | th.Tensor], th.Tensor]:
+    def bind(self, condition: th.Tensor) -> NoisePredictor:
         """
         Do what is the same for all steps of a chain once: the condition's and the steps' parts of the first layer.
 
@@ -79,16 +80,84 @@ class MLPDenoiser(nn.Module):
         from_condition = linear(condition, condition_weight, self.input_layer.bias)
         from_time = linear(self.time_mlp(self.time_table), time_weight)
 
-        def predict_noise(noisy_action: th.Tensor, step: int | th.Tensor) -> th.Tensor:
-            return self.network(th.addmm(from_condition + from_time[step], noisy_action, action_weight.t()))
+        def predict_noise(noisy_action: th.Tensor, step: int | float | th.Tensor) -> th.Tensor:
+            return self.network(th.addmm(from_condition + at_step(from_time, step), noisy_action, action_weight.t()))
 
         return predict_noise
 
-    def forward(self, noisy_action: th.Tensor, step: int | th.Tensor, condition: th.Tensor) -> th.Tensor:
+    def forward(self, noisy_action: th.Tensor, step: int | float | th.Tensor, condition: th.Tensor) -> th.Tensor:
         """
         :param noisy_action: a^k, shape ``(batch, d)``
-        :param step: Index of the diffusion step, ``0..K-1``: one for all, or shape ``(batch,)``
+        :param step: Diffusion step in [0, K-1], an index or a number between two: one for all, or shape ``(batch,)``
         :param condition: Features of the observation, shape ``(batch, condition_dim)``
         :return: Predicted noise, shape ``(batch, d)``
         """
         return self.bind(condition)(noisy_action, step)
+
+
+class ResidualMLPDenoiser(nn.Module):
+    """
+    Residual blocks with layer normalisation in front, each widening fourfold, as in IDQL (Hansen-Estruch et al., 2023) and SimBa
+    (Lee et al., 2024): deeper and larger networks keep training where a plain one stalls.
+
+    :param action_dim: Number of action components d
+    :param condition_dim: Number of features of the observation
+    :param n_steps: Number of diffusion steps K
+    :param net_arch: One equal width for each block, like ``[256, 256]``
+    :param activation_fn: Activation class
+    :param time_embedding_dim: Size of the embedding of the diffusion step
+    :param widening: Width inside a block, over the width between blocks
+    :raises ValueError: If the widths differ or there is none
+    """
+
+    time_table: th.Tensor
+
+    def __init__(
+        self,
+        action_dim: int,
+        condition_dim: int,
+        n_steps: int,
+        net_arch: list[int],
+        activation_fn: type[nn.Module] = nn.Mish,
+        time_embedding_dim: int = 16,
+        widening: int = 4,
+    ) -> None:
+        super().__init__()
+        width = one_width(net_arch)
+        self.action_dim = action_dim
+        self.register_buffer("time_table", sinusoidal_embedding(n_steps, time_embedding_dim), persistent=False)
+        self.input_layer = nn.Linear(action_dim + time_embedding_dim + condition_dim, width)
+        self.blocks = nn.ModuleList(
+            nn.Sequential(
+                nn.LayerNorm(width),
+                Linear(width, widening * width),
+                fast(activation_fn)(),
+                Linear(widening * width, width),
+            )
+            for _ in net_arch
+        )
+        self.output_layer = nn.Sequential(nn.LayerNorm(width), Linear(width, action_dim))
+
+    def forward(self, noisy_action: th.Tensor, step: int | float | th.Tensor, condition: th.Tensor) -> th.Tensor:
+        """
+        :param noisy_action: a^k, shape ``(batch, d)``
+        :param step: Diffusion step in [0, K-1], an index or a number between two: one for all, or shape ``(batch,)``
+        :param condition: Features of the observation, shape ``(batch, condition_dim)``
+        :return: Predicted noise, shape ``(batch, d)``
+        """
+        time = at_step(self.time_table, step).expand(len(noisy_action), -1)
+        hidden = self.input_layer(th.cat([noisy_action, time, condition], dim=1))
+        for block in self.blocks:
+            hidden = hidden + block(hidden)
+        return self.output_layer(hidden)
+
+
+def one_width(net_arch: list[int]) -> int:
+    """
+    :param net_arch: Hidden layers
+    :return: Their width
+    :raises ValueError: If there is none, or more than one
+    """
+    if len(set(net_arch)) != 1:
+        raise ValueError(f"net_arch must hold one equal width for each block of this denoiser, like [256, 256], got {net_arch!r}")
+    return net_arch[0]
