@@ -135,7 +135,7 @@ class CausalGDP(OfflineToOnlineAlgorithm):
     :param max_grad_norm: Bound of the gradient norms of the actor and of the critics, None for no bound
     :param diffusion_steps: Number of diffusion steps K
     :param noise_schedule: ``vp`` (Diffusion-QL), ``linear`` (DDPM) or ``cosine``
-    :param sampler: ``ddpm`` or ``ddim``
+    :param sampler: ``ddpm``, ``ddim``, ``euler_maruyama``, ``heun`` or ``dpm_solver``
     :param ddim_eta: Noise of DDIM, from 0 (deterministic) to 1 (DDPM)
     :param n_action_candidates: Number of sampled actions of which a prediction takes the best by the smallest target Q
     :param exploration_noise: Standard deviation of the Gaussian noise of non-deterministic predictions, for actions in [-1, 1]
@@ -876,7 +876,15 @@ class CausalGDP(OfflineToOnlineAlgorithm):
                     predicted, _ = self.world_model.predict_next_state(state, transitions.actions)
                 next_state = th.where(transitions.dones > 0.0, predicted, next_state)
             guidance = self.policy.make_guidance(state, next_state, next_actions, climbed)
-        denoising = denoising_loss(self.actor.denoiser, self.actor.schedule, features, transitions.actions, guidance, rule)
+        denoising = denoising_loss(
+            self.actor.denoiser,
+            self.actor.schedule,
+            features,
+            transitions.actions,
+            guidance,
+            rule,
+            self.actor.is_continuous,
+        )
         actions = denoising.clean_actions if self.actor_update == "one_step" else self.actor.sample(features)
         return denoising, self._q_term(observations, actions, transitions.actions, climbed)
 

@@ -30,7 +30,7 @@ from sb3_causalgdp.arguments import POLICY_ARGUMENTS, check_arguments, check_key
 from sb3_causalgdp.causal import CausalGuidance, LinearisedGuidance, MaskedWorldModel, ReturnTarget, RewardTarget
 from sb3_causalgdp.causal.guidance import OutcomeTarget
 from sb3_causalgdp.checks import first_not_finite_index, fits_float32, is_finite
-from sb3_causalgdp.diffusion import Guidance, GuidanceRule, MLPDenoiser, NoiseSchedule, sample
+from sb3_causalgdp.diffusion import Guidance, GuidanceRule, NoiseSchedule, make_denoiser, sample
 from sb3_causalgdp.diffusion.samplers import bind, check_sampler
 from sb3_causalgdp.divergence import TrainingDivergedError, first_not_finite
 from sb3_causalgdp.files import saved_when_done
@@ -138,8 +138,11 @@ class DiffusionActor(_PickledAlone, BasePolicy):
     :param normalize_images: Whether to divide images by 255
     :param diffusion_steps: Number of diffusion steps K
     :param noise_schedule: ``vp``, ``linear`` or ``cosine``
-    :param sampler: ``ddpm`` or ``ddim``
+    :param sampler: One of :data:`~sb3_causalgdp.diffusion.SAMPLERS`
     :param ddim_eta: Noise of DDIM, in [0, 1]
+    :param sampling_steps: Number of the sampler's steps, None for K
+    :param denoiser: Name or class of the denoiser, see :func:`~sb3_causalgdp.diffusion.make_denoiser`
+    :param denoiser_kwargs: Further arguments of the denoiser
     """
 
     # Noise's share of the variance from which an action is adapted to a state near by
@@ -158,6 +161,9 @@ class DiffusionActor(_PickledAlone, BasePolicy):
         noise_schedule: str = "vp",
         sampler: str = "ddpm",
         ddim_eta: float = 0.0,
+        sampling_steps: int | None = None,
+        denoiser: str | type[nn.Module] = "mlp",
+        denoiser_kwargs: dict[str, Any] | None = None,
     ) -> None:
         super().__init__(
             observation_space,
@@ -166,17 +172,25 @@ class DiffusionActor(_PickledAlone, BasePolicy):
             normalize_images=normalize_images,
             squash_output=True,
         )
-        check_sampler(sampler, ddim_eta)
+        check_sampler(sampler, ddim_eta, sampling_steps)
         self.action_dim = get_action_dim(action_space)
         self.net_arch = net_arch
         self.features_dim = features_dim
         self.activation_fn = activation_fn
         self.sampler = sampler
         self.ddim_eta = ddim_eta
+        self.sampling_steps = sampling_steps
+        self.denoiser_kwargs = denoiser_kwargs
         self.schedule = NoiseSchedule(noise_schedule, diffusion_steps)
+        self.n_noises = diffusion_steps if sampling_steps is None else sampling_steps
+        # A denoiser that is asked between its steps learns what is between them
+        self.is_continuous = self.n_noises != diffusion_steps
         noisy_enough = (i for i, signal in enumerate(self.schedule.alpha_bar_list) if 1.0 - signal >= self.ADAPTING_NOISE)
         self.adapting_step = next(noisy_enough, self.schedule.n_steps - 1)
-        self.denoiser = MLPDenoiser(self.action_dim, features_dim, diffusion_steps, net_arch, activation_fn)
+        self.denoiser_class = denoiser
+        self.denoiser = make_denoiser(
+            denoiser, self.action_dim, features_dim, diffusion_steps, net_arch, activation_fn, denoiser_kwargs
+        )
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         data = super()._get_constructor_parameters()
@@ -189,6 +203,9 @@ class DiffusionActor(_PickledAlone, BasePolicy):
             noise_schedule=self.schedule.name,
             sampler=self.sampler,
             ddim_eta=self.ddim_eta,
+            sampling_steps=self.sampling_steps,
+            denoiser=self.denoiser_class,
+            denoiser_kwargs=self.denoiser_kwargs,
         )
         return data
 
@@ -211,7 +228,7 @@ class DiffusionActor(_PickledAlone, BasePolicy):
         Denoise actions, see :func:`sb3_causalgdp.diffusion.sample`.
 
         :param features: Shape ``(batch, features_dim)``
-        :param noise: Shape ``(K, batch, d)``, drawn if None
+        :param noise: Shape ``(sampling_steps, batch, d)``, drawn if None
         :param guidance: Causal guidance, None for none
         :param rule: How the guidance enters a step
         :param divergences: If a list, each guided step appends its KL divergence
@@ -226,6 +243,7 @@ class DiffusionActor(_PickledAlone, BasePolicy):
             noise=noise,
             sampler=self.sampler,
             eta=self.ddim_eta,
+            n_steps=self.sampling_steps,
             divergences=divergences,
         )
 
@@ -244,7 +262,7 @@ class DiffusionActor(_PickledAlone, BasePolicy):
 
     def forward(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         features = self.features(observation)
-        shape = (self.schedule.n_steps, len(features), self.action_dim)
+        shape = (self.n_noises, len(features), self.action_dim)
         return self.sample(features, th.zeros(shape, device=features.device) if deterministic else None)
 
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
@@ -275,8 +293,13 @@ class CausalGDPPolicy(BasePolicy):
     :param world_model_net_arch: Hidden layers of the world model, all of one size, ``[128, 128]`` by default
     :param diffusion_steps: Number of diffusion steps K
     :param noise_schedule: ``vp``, ``linear`` or ``cosine``
-    :param sampler: ``ddpm`` or ``ddim``
+    :param sampler: One of :data:`~sb3_causalgdp.diffusion.SAMPLERS`
     :param ddim_eta: Noise of DDIM, in [0, 1]
+    :param sampling_steps: Number of the sampler's steps, None for K. With another number the denoiser learns, and is asked, at
+        all times between the diffusion steps
+    :param denoiser: ``mlp``, ``residual_mlp``, ``transformer``, or a class of your own, see
+        :func:`~sb3_causalgdp.diffusion.make_denoiser`
+    :param denoiser_kwargs: Further arguments of the denoiser
     :param guidance: ``posterior``, ``score``, ``normalized``, or None for no guidance
     :param guidance_covariance: ``tweedie``, ``isotropic`` or ``unit_gaussian``, see
         :class:`~sb3_causalgdp.diffusion.GuidanceRule`
@@ -318,6 +341,9 @@ class CausalGDPPolicy(BasePolicy):
         noise_schedule: str = "vp",
         sampler: str = "ddpm",
         ddim_eta: float = 0.0,
+        sampling_steps: int | None = None,
+        denoiser: str | type[nn.Module] = "mlp",
+        denoiser_kwargs: dict[str, Any] | None = None,
         guidance: str | None = "posterior",
         guidance_covariance: str = "unit_gaussian",
         guidance_target: str = "return",
@@ -378,6 +404,9 @@ class CausalGDPPolicy(BasePolicy):
             "noise_schedule": noise_schedule,
             "sampler": sampler,
             "ddim_eta": ddim_eta,
+            "sampling_steps": sampling_steps,
+            "denoiser": denoiser,
+            "denoiser_kwargs": denoiser_kwargs,
         }
         self.actor_kwargs = {**shared_kwargs, "net_arch": actor_arch, **self.diffusion_kwargs}
         self.critic_kwargs = {
@@ -440,7 +469,7 @@ class CausalGDPPolicy(BasePolicy):
     def _fixed_candidate_noise(self) -> th.Tensor:
         """Noise of deterministic predictions: none for the first candidate, the same at every call for the others."""
         generator = th.Generator().manual_seed(0)
-        shape = (self.actor.schedule.n_steps, self.n_action_candidates, self.actor.action_dim)
+        shape = (self.actor.n_noises, self.n_action_candidates, self.actor.action_dim)
         noise = th.randn(shape, generator=generator)
         noise[:, 0] = 0.0
         return noise
