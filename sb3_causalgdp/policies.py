@@ -439,6 +439,7 @@ class CausalGDPPolicy(BasePolicy):
         self.has_image_state = any(
             is_image_space(space, normalized_image=not self.normalize_images) for space in _leaf_spaces(self.observation_space)
         )
+        self._check_attention()
         self.world_model = MaskedWorldModel(self._state_dim(), self.actor.action_dim, self.world_model_net_arch)
         self.register_buffer("candidate_noise", self._fixed_candidate_noise(), persistent=False)
 
@@ -473,6 +474,24 @@ class CausalGDPPolicy(BasePolicy):
         noise = th.randn(shape, generator=generator)
         noise[:, 0] = 0.0
         return noise
+
+    def _check_attention(self) -> None:
+        plain = type(self.actor.features_extractor) in (FlattenExtractor, CombinedExtractor) and not self.has_image_state
+        if getattr(self.actor.denoiser, "causal", False) and not plain:
+            raise ValueError(
+                "denoiser_kwargs={'causal': True} needs observations that are vectors and no features extractor, got "
+                f"{type(self.actor.features_extractor).__name__} for {self.observation_space}"
+            )
+
+    def set_attention(self, masks: Sequence[th.Tensor]) -> None:
+        """
+        Let a denoiser look along a causal graph, where it was made to.
+
+        :param masks: As :meth:`~sb3_causalgdp.causal.MaskedWorldModel.set_masks` takes them
+        """
+        for actor in (self.actor, self.actor_target):
+            if getattr(actor.denoiser, "causal", False):
+                actor.denoiser.set_graph(*masks)  # type: ignore[operator]
 
     def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> DiffusionActor:
         return DiffusionActor(**self._update_features_extractor(self.actor_kwargs, features_extractor)).to(self.device)
