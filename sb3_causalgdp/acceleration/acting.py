@@ -560,6 +560,8 @@ class NumpyActing:
         :return: Whether this class can act for it: vectors of observations as they are, plain layers in float32 on a CPU or a
             GPU of CUDA, and a guidance without the denoiser's Jacobian
         """
+        if type(policy.actor.denoiser) is not MLPDenoiser:
+            return False
         rule, activation = policy.guidance_rule, policy.activation_fn
         critics = (_without_norms(network)[0] for network in policy.critic_target.q_networks)
         networks: list[Any] = [policy.actor.denoiser.network, *critics]
@@ -569,7 +571,6 @@ class NumpyActing:
             and not policy.has_image_state
             and type(policy.actor.features_extractor) is FlattenExtractor
             and type(policy.critic_target.features_extractor) is FlattenExtractor
-            and type(policy.actor.denoiser) is MLPDenoiser
             and activation in ACTIVATIONS
             and all(_has_plain_layers(network, activation) for network in networks)
             and all(parameter.dtype == th.float32 for parameter in policy.parameters())
