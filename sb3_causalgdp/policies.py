@@ -241,6 +241,7 @@ class DiffusionActor(_PickledAlone, BasePolicy):
             guidance,
             rule,
             noise=noise,
+            action_dim=self.action_dim,
             sampler=self.sampler,
             eta=self.ddim_eta,
             n_steps=self.sampling_steps,
