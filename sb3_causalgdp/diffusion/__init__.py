@@ -3,6 +3,7 @@
 from sb3_causalgdp.diffusion.denoiser_types import DENOISERS, DenoiserNetwork, check_denoiser, make_denoiser
 from sb3_causalgdp.diffusion.denoisers import MLPDenoiser, ResidualMLPDenoiser
 from sb3_causalgdp.diffusion.guidance import GUIDANCE_COVARIANCES, GUIDANCE_MODES, Guidance, GuidanceRule
+from sb3_causalgdp.diffusion.guided_scheduler import ActionUnits, GuidedScheduler
 from sb3_causalgdp.diffusion.plans import SAMPLERS, SPACINGS
 from sb3_causalgdp.diffusion.samplers import sample
 from sb3_causalgdp.diffusion.schedules import NOISE_SCHEDULES, NoiseSchedule
@@ -15,9 +16,11 @@ __all__ = [
     "NOISE_SCHEDULES",
     "SAMPLERS",
     "SPACINGS",
+    "ActionUnits",
     "DenoiserNetwork",
     "Guidance",
     "GuidanceRule",
+    "GuidedScheduler",
     "MLPDenoiser",
     "NoiseSchedule",
     "ResidualMLPDenoiser",

@@ -18,8 +18,8 @@ DENOISERS: dict[str, Callable[..., nn.Module]] = {
 
 class DenoiserNetwork(Protocol):
     """
-    What a class of one's own has to be: a ``torch.nn.Module`` that can be made and called like this. :func:`check_denoiser` says
-    what is wrong with one.
+    What a class of one's own has to be: a ``torch.nn.Module`` that can be made and called like this. :func:`check_denoiser`
+    says what is wrong with one.
 
     :param action_dim: Number of action components d
     :param condition_dim: Number of features of the observation
@@ -85,9 +85,9 @@ def check_denoiser(denoiser: nn.Module, action_dim: int, condition_dim: int, n_s
     :param action_dim: Number of action components d
     :param condition_dim: Number of features of the observation
     :param n_steps: Number of diffusion steps K
-    :raises ValueError: If the output is not a tensor of shape ``(batch, d)``, or of another type than the input, or not finite;
-        if no gradient leads to the parameters or to the noisy action; if a row depends on the other rows of its batch; or if it
-        takes no index, no tensor of indices or no fraction for the step
+    :raises ValueError: If the output is not a tensor of shape ``(batch, d)``, or of another type than the input, or not
+        finite; if no gradient leads to the parameters or to the noisy action; if a row depends on the other rows of its batch;
+        or if it takes no index, no tensor of indices or no fraction for the step
     """
     name = f"denoiser {type(denoiser).__name__}"
     generator = th.Generator().manual_seed(0)
@@ -106,7 +106,9 @@ def check_denoiser(denoiser: nn.Module, action_dim: int, condition_dim: int, n_s
         denoiser.train(was_training)
 
 
-def _called(denoiser: nn.Module, name: str, action: th.Tensor, step: int | float | th.Tensor, condition: th.Tensor) -> th.Tensor:
+def _called(
+    denoiser: nn.Module, name: str, action: th.Tensor, step: int | float | th.Tensor, condition: th.Tensor
+) -> th.Tensor:
     kind = f"{step.dtype} of shape {tuple(step.shape)}" if isinstance(step, th.Tensor) else repr(step)
     try:
         return denoiser(action, step, condition)

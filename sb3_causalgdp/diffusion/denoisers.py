@@ -97,8 +97,8 @@ class MLPDenoiser(nn.Module):
 
 class ResidualMLPDenoiser(nn.Module):
     """
-    Residual blocks with layer normalisation in front, each widening fourfold, as in IDQL (Hansen-Estruch et al., 2023) and SimBa
-    (Lee et al., 2024): deeper and larger networks keep training where a plain one stalls.
+    Residual blocks with layer normalisation in front, each widening fourfold, as in IDQL (Hansen-Estruch et al., 2023) and
+    SimBa (Lee et al., 2024): deeper and larger networks keep training where a plain one stalls.
 
     :param action_dim: Number of action components d
     :param condition_dim: Number of features of the observation
@@ -159,5 +159,7 @@ def one_width(net_arch: list[int]) -> int:
     :raises ValueError: If there is none, or more than one
     """
     if len(set(net_arch)) != 1:
-        raise ValueError(f"net_arch must hold one equal width for each block of this denoiser, like [256, 256], got {net_arch!r}")
+        raise ValueError(
+            f"net_arch must hold an equal width for each block of this denoiser, like [256, 256], got {net_arch!r}"
+        )
     return net_arch[0]

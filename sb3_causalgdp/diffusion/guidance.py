@@ -10,8 +10,8 @@ from sb3_causalgdp.diffusion.schedules import NoiseSchedule, at_step
 
 NoisePredictor = Callable[[th.Tensor, int | float | th.Tensor], th.Tensor]
 """
-Predicts the noise, shape ``(batch, d)``, from the noisy action and the diffusion step: an index, or, where a sampler takes other
-steps than the schedule's, a floating point number between two.
+Predicts the noise, shape ``(batch, d)``, from the noisy action and the diffusion step: an index, or, where a sampler takes
+other steps than the schedule's, a floating point number between two.
 """
 
 GUIDANCE_MODES = ("posterior", "score", "normalized")

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Sequence
+from itertools import pairwise
 from typing import NamedTuple
 
 from sb3_causalgdp.diffusion.schedules import NoiseSchedule
@@ -11,8 +12,8 @@ class Stage(NamedTuple):
     """
     One evaluation of the denoiser and the move that follows: a sum of what is there, and noise.
 
-    ``a' = by_clean a0_hat + by_noisy a + by_previous_clean a0_hat_- + by_previous_noisy a_- + std z``, where ``_-`` is what the
-    stage before had. The last stage returns the clean estimate.
+    ``a' = by_clean a0_hat + by_noisy a + by_previous_clean a0_hat_- + by_previous_noisy a_- + std z``, where ``_-`` is what
+    the stage before had. The last stage returns the clean estimate.
 
     :param point: Position of the time in the sampler's grid, from 0 at the clean end
     :param step: Diffusion step of the denoiser, an index, or a fraction between two
@@ -77,8 +78,8 @@ class Point(NamedTuple):
 
 def sampling_points(schedule: NoiseSchedule, n_steps: int | None = None, spacing: str = "time") -> list[Point]:
     """
-    The times at which a sampler asks the denoiser, all of them between the first and the last of the schedule, between which it
-    was trained.
+    The times at which a sampler asks the denoiser, all of them between the first and the last of the schedule, between which
+    it was trained.
 
     :param schedule: Noise schedule with K steps
     :param n_steps: Number of times, None for the schedule's own
@@ -116,7 +117,7 @@ def step_of_log_snr(schedule: NoiseSchedule, log_snr: float) -> float:
     values = schedule.log_snr_list
     if log_snr >= values[0]:
         return 0.0
-    for below, (high, low) in enumerate(zip(values[:-1], values[1:], strict=True)):
+    for below, (high, low) in enumerate(pairwise(values)):
         if log_snr >= low:
             return below + (high - log_snr) / (high - low)
     return float(len(values) - 1)
@@ -155,10 +156,11 @@ def _ancestral(points: Sequence[Point], eta: float) -> list[Stage]:
 
 def _euler_maruyama(points: Sequence[Point], eta: float) -> list[Stage]:
     """
-    The reverse SDE ``da = -beta (a / 2 + score) dt + sqrt(beta) dw``, backwards in time. For ``x = a / signal`` there is no drift but
-    the score's, and with the clock ``sigma^2 = (spread / signal)^2`` it is ``dx = -score dsigma^2 + dw``: the only error of a step
-    is that of a score that stands still, and the mean of a Gaussian has none. The noise is that which the forward process adds
-    in the step, at most 1, where the scheme's own would grow with sigma over the few large steps that are usual here.
+    The reverse SDE ``da = -beta (a / 2 + score) dt + sqrt(beta) dw``, backwards in time. For ``x = a / signal`` there is no
+    drift but the score's, and with the clock ``sigma^2 = (spread / signal)^2`` it is ``dx = -score dsigma^2 + dw``: the only
+    error of a step is that of a score that stands still, and the mean of a Gaussian has none. The noise is that which the
+    forward process adds in the step, at most 1, where the scheme's own would grow with sigma over the few large steps that are
+    usual here.
     """
     stages = []
     for point, following in zip(points[:0:-1], points[-2::-1], strict=True):
@@ -171,8 +173,8 @@ def _euler_maruyama(points: Sequence[Point], eta: float) -> list[Stage]:
 
 def _heun(points: Sequence[Point], eta: float) -> list[Stage]:
     """
-    The probability-flow ODE. For ``x = a / signal`` and ``sigma = spread / signal`` it is ``dx / dsigma = eps`` (Karras et al.,
-    2022, algorithm 1): a step of Euler's, which is DDIM's, and the mean of the noises at both of its ends.
+    The probability-flow ODE. For ``x = a / signal`` and ``sigma = spread / signal`` it is ``dx / dsigma = eps`` (Karras et
+    al., 2022, algorithm 1): a step of Euler's, which is DDIM's, and the mean of the noises at both of its ends.
     """
     stages = []
     for point, following in zip(points[:0:-1], points[-2::-1], strict=True):
@@ -229,7 +231,8 @@ def sampling_plan(
     :param schedule: Noise schedule with K steps
     :param sampler: One of :data:`SAMPLERS`
     :param eta: Noise of DDIM: 0 is deterministic, 1 is DDPM
-    :param n_steps: Number of the sampler's steps, None for K; ``heun`` evaluates the denoiser twice in all of them but the last
+    :param n_steps: Number of the sampler's steps, None for K; ``heun`` evaluates the denoiser twice in all of them but the
+        last
     :param spacing: ``time`` or ``log_snr``, see :func:`sampling_points`
     :return: The evaluations of the denoiser, from noise to the action
     """

@@ -13,8 +13,8 @@ from sb3_causalgdp.diffusion.schedules import NoiseSchedule
 
 Denoiser = Callable[[th.Tensor, int | float | th.Tensor, th.Tensor], th.Tensor]
 """
-Predicts the noise, shape ``(batch, d)``, from the noisy action, the diffusion step and the condition. The step is an index; where
-a sampler takes other steps than the schedule's, a floating point number between two.
+Predicts the noise, shape ``(batch, d)``, from the noisy action, the diffusion step and the condition. The step is an index;
+where a sampler takes other steps than the schedule's, a floating point number between two.
 """
 
 

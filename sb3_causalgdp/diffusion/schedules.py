@@ -66,8 +66,8 @@ NOISE_SCHEDULES: dict[str, Callable[[int], th.Tensor]] = {
 
 def at_step(table: th.Tensor, step: int | float | th.Tensor) -> th.Tensor:
     """
-    Rows of a table that has one for each diffusion step. At a time between two steps, what is between their rows: a network that
-    was trained at the steps alone has seen nothing else.
+    Rows of a table that has one for each diffusion step. At a time between two steps, what is between their rows: a network
+    that was trained at the steps alone has seen nothing else.
 
     :param table: Shape ``(K, ...)``
     :param step: Diffusion step in [0, K-1], an index or a number between two: one, or shape ``(batch,)``

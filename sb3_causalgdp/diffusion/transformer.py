@@ -17,8 +17,8 @@ def causal_attention(
     threshold: float = 0.5,
 ) -> th.Tensor:
     """
-    What each action component looks at: the states that it influences, and all that these effects depend on besides. The reward
-    is an effect like a next state.
+    What each action component looks at: the states that it influences, and all that these effects depend on besides. The
+    reward is an effect like a next state.
 
     :param state_to_state: Probability that s_i causes s'_j, entry ``[j, i]``, shape ``(n, n)``
     :param action_to_state: Probability that a_k causes s'_j, entry ``[j, k]``, shape ``(n, d)``
@@ -43,12 +43,12 @@ def causal_attention(
 
 class TransformerDenoiser(nn.Module):
     """
-    Predicts the noise with a transformer whose tokens are the variables of the state, the action's components and the diffusion
-    step.
+    Predicts the noise with a transformer whose tokens are the variables of the state, the action's components and the
+    diffusion step.
 
-    After :meth:`set_graph`, a token of an action looks at the tokens of :func:`causal_attention` and at the step, and tokens of
-    states at themselves: no other state can change what the first layer says of it. Through an action that it looks at, deeper
-    layers may see what that one sees.
+    After :meth:`set_graph`, a token of an action looks at the tokens of :func:`causal_attention` and at the step, and tokens
+    of states at themselves: no other state can change what the first layer says of it. Through an action that it looks at,
+    deeper layers may see what that one sees.
 
     :param action_dim: Number of action components d
     :param condition_dim: Number of features of the observation, one token each
@@ -114,7 +114,7 @@ class TransformerDenoiser(nn.Module):
         """
         wanted = (self.condition_dim, self.action_dim)
         if tuple(action_to_state.shape) != wanted:
-            raise ValueError(f"action_to_state must have the shape {wanted} of this denoiser, got {tuple(action_to_state.shape)}")
+            raise ValueError(f"action_to_state must have the denoiser's shape {wanted}, got {tuple(action_to_state.shape)}")
         seen = causal_attention(state_to_state, action_to_state, state_to_reward, action_to_reward, threshold)
         attention = th.eye(len(self.attention))
         attention[self.condition_dim : -1, :-1] = seen.float()

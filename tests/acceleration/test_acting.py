@@ -17,7 +17,9 @@ from sb3_causalgdp.offline.replay import SpacesEnv
 N_STATES, N_ACTIONS = 5, 3
 
 
-def make_policy(seed=0, observation_space=None, net_arch=(16, 16), activation_fn="relu", critic_layer_norm=False, more=None, **kwargs):
+def make_policy(
+    seed=0, observation_space=None, net_arch=(16, 16), activation_fn="relu", critic_layer_norm=False, more=None, **kwargs
+):
     """A policy whose weights, masks and statistics are all different from their start values, and whose guidance is on."""
     observation_space = observation_space or spaces.Box(-3.0, 3.0, (N_STATES,), np.float32)
     environment = SpacesEnv(observation_space, spaces.Box(-1.0, 1.0, (N_ACTIONS,), np.float32))

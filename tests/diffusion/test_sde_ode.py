@@ -74,7 +74,7 @@ class Mixture:
         return (x - math.sqrt(1.0 - alpha_bar) * self.noise(x, alpha_bar)) / math.sqrt(alpha_bar)
 
     def exact_end(self, schedule, start):
-        """The probability-flow ODE from noise to the last diffusion step, solved to ten digits, and the clean estimate there."""
+        """The probability-flow ODE from noise to the last diffusion step, to ten digits, and the clean estimate there."""
         sigma_of = {index: math.sqrt(1.0 / schedule.alpha_bar_list[index] - 1.0) for index in (0, -1)}
 
         def derivative(sigma, x):
