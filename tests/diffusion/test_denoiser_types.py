@@ -175,7 +175,7 @@ GRAPH = (STATE_TO_STATE, ACTION_TO_STATE, STATE_TO_REWARD, ACTION_TO_REWARD)
 
 def test_an_action_looks_at_what_it_influences_and_what_its_effect_depends_on():
     seen = causal_attention(*GRAPH)
-    # a_0 at s_0 (a cause of s'_0, and what a_0 moves) and itself; a_1 at s_0 (a cause of s'_1), at s_1 (which it moves) and itself
+    # a_0 at s_0, a cause of s'_0 that it moves, and itself; a_1 at s_0, a cause of s'_1, at s_1, which it moves, and itself
     assert seen.tolist() == [[True, False, False, True, False], [True, True, False, False, True]]
     together = causal_attention(*GRAPH[:3], th.ones(2))
     # A reward that reads both actions, and s'_1
