@@ -95,8 +95,8 @@ class GuidedScheduler:
         replaced before each chain, ``scheduler.guidance = ...``
     :param rule: How the guidance enters a step, :class:`GuidanceRule` with the covariance ``unit_gaussian`` if None
     :param model: The network, bound to its condition: ``model(sample, timestep)``, the sample scaled as the scheduler's
-        ``scale_model_input`` does it; needed by the covariances ``tweedie`` and ``isotropic``, which take its Jacobian, and, as
-        ``guidance``, replaced before each chain
+        ``scale_model_input`` does it; needed by the covariances ``tweedie`` and ``isotropic``, which take its Jacobian; as
+        ``guidance``, it may be replaced before each chain
     :param units: Units of the network's actions
     :param position: The action of a chunk that the guidance is about, counted along the horizon; None for the whole chunk,
         which the guidance then gets as one row of ``horizon * d`` components
