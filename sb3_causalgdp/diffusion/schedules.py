@@ -73,6 +73,8 @@ def at_step(table: th.Tensor, step: int | float | th.Tensor) -> th.Tensor:
     :param step: Diffusion step in [0, K-1], an index or a number between two: one, or shape ``(batch,)``
     :return: Shape ``(...)``, or ``(batch, ...)``
     """
+    if isinstance(step, int):
+        return table[step]
     last = len(table) - 1
     if isinstance(step, th.Tensor) and step.is_floating_point():
         lower = step.floor().long().clamp(0, last)
