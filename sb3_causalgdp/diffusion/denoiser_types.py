@@ -155,7 +155,7 @@ def _check_rows(
     def check(other: th.Tensor, expected: th.Tensor, what: str) -> None:
         _check_output(name, other, expected)
         if not th.allclose(other, expected, rtol=1e-3, atol=1e-4):
-            difference = float((other - expected).abs().max())
+            difference = float((other - expected).detach().abs().max())
             raise ValueError(f"{name} must return the same for {what}, got a difference of {difference:.3g}")
 
     last = n_steps - 1
