@@ -21,7 +21,8 @@ from torch import nn
 
 from sb3_causalgdp.causal.discovery import DISCOVERY_METHODS
 from sb3_causalgdp.diffusion.guidance import GUIDANCE_COVARIANCES, GUIDANCE_MODES
-from sb3_causalgdp.diffusion.samplers import SAMPLERS
+from sb3_causalgdp.diffusion.denoiser_types import DENOISERS
+from sb3_causalgdp.diffusion.plans import SAMPLERS
 from sb3_causalgdp.diffusion.schedules import NOISE_SCHEDULES
 from sb3_causalgdp.offline.rewards import REWARD_TRANSFORMS
 
@@ -372,6 +373,9 @@ POLICY_ARGUMENTS: dict[str, Kind] = {
     )
     | NONE,
     **SHARED_ARGUMENTS,
+    "sampling_steps": integer(1, MOST_DIFFUSION_STEPS) | NONE,
+    "denoiser": choice(DENOISERS) | subclass(nn.Module, "a class of torch.nn"),
+    "denoiser_kwargs": KEYWORDS | NONE,
     "discount": SHARE,
 }
 """Every argument of :class:`~sb3_causalgdp.policies.CausalGDPPolicy`, what goes into ``policy_kwargs`` among them."""

@@ -94,7 +94,7 @@ class CausalGDP(AskedAlgorithm, SavedAlgorithm):
     :param max_grad_norm: Bound of the gradient norms of the actor and of the critics, None for no bound
     :param diffusion_steps: Number of diffusion steps K
     :param noise_schedule: ``vp`` (Diffusion-QL), ``linear`` (DDPM) or ``cosine``
-    :param sampler: ``ddpm`` or ``ddim``
+    :param sampler: ``ddpm``, ``ddim``, ``euler_maruyama``, ``heun`` or ``dpm_solver``
     :param ddim_eta: Noise of DDIM, from 0 (deterministic) to 1 (DDPM)
     :param n_action_candidates: Number of sampled actions of which a prediction takes the best by the smallest target Q
     :param exploration_noise: Standard deviation of the Gaussian noise of non-deterministic predictions, for actions in [-1, 1]

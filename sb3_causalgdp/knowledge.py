@@ -66,8 +66,10 @@ class DiscoveringAlgorithm(OfflineToOnlineAlgorithm):
             raise ValueError(
                 f"The graph is about {graph.variables.names}, but this model's variables are {self.transition_variables.names}"
             )
-        masks = (graph.state_to_state, graph.action_to_state, graph.state_to_reward, graph.action_to_reward)
-        self.world_model.set_masks(*(th.as_tensor(mask, dtype=th.float32, device=self.device) for mask in masks))
+        arrays = (graph.state_to_state, graph.action_to_state, graph.state_to_reward, graph.action_to_reward)
+        masks = [th.as_tensor(mask, dtype=th.float32, device=self.device) for mask in arrays]
+        self.world_model.set_masks(*masks)
+        self.policy.set_attention(masks)
         self.policy.guidance_ready.fill_(1.0)
         self._causal_graph = graph
         self.causal_graph_history.append(graph)

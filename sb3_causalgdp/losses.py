@@ -72,6 +72,7 @@ def denoising_loss(
     actions: th.Tensor,
     guidance: Guidance | None = None,
     rule: GuidanceRule | None = None,
+    continuous: bool = False,
 ) -> DenoisingTerms:
     """
     ``E || eps_theta(a^k, k, s) - eps_cg ||^2``: the noise really injected, shifted by the guidance (stop-gradient).
@@ -82,9 +83,14 @@ def denoising_loss(
     :param actions: Clean actions, shape ``(batch, d)``
     :param guidance: What shifts the target, None for the plain denoising loss
     :param rule: How the guidance enters, needed with a guidance
+    :param continuous: Whether times are drawn from all between the first and the last diffusion step, for samplers that take
+        other steps than the schedule's (denoising score matching in continuous time, Song et al., 2021, equation 7)
     :return: The loss, and what the same noise prediction says of the clean actions
     """
-    step = th.randint(schedule.n_steps, (len(actions),), device=actions.device)
+    if continuous:
+        step = th.rand(len(actions), device=actions.device) * (schedule.n_steps - 1)
+    else:
+        step = th.randint(schedule.n_steps, (len(actions),), device=actions.device)
     noise = th.randn_like(actions)
     noisy = schedule.add_noise(actions, noise, step)
     predict_noise = bind(denoiser, features)

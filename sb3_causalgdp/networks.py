@@ -14,7 +14,7 @@ from stable_baselines3.common.type_aliases import PyTorchObs
 from torch import nn
 
 from sb3_causalgdp.acceleration.products import make_layers_fast
-from sb3_causalgdp.diffusion import Guidance, GuidanceRule, MLPDenoiser, NoiseSchedule, sample
+from sb3_causalgdp.diffusion import Guidance, GuidanceRule, NoiseSchedule, make_denoiser, sample
 from sb3_causalgdp.diffusion.samplers import bind, check_sampler
 from sb3_causalgdp.saving.policies import PickledAlone
 
@@ -146,10 +146,13 @@ class DiffusionActor(PickledAlone, BasePolicy):
     :param normalize_images: Whether to divide images by 255
     :param diffusion_steps: Number of diffusion steps K
     :param noise_schedule: ``vp``, ``linear`` or ``cosine``
-    :param sampler: ``ddpm`` or ``ddim``
+    :param sampler: One of :data:`~sb3_causalgdp.diffusion.SAMPLERS`
     :param ddim_eta: Noise of DDIM, in [0, 1]
-    :param prediction_type: What the denoiser predicts: ``noise``, or ``velocity``, see
-        :class:`~sb3_causalgdp.diffusion.MLPDenoiser`
+    :param prediction_type: What a named denoiser predicts: ``noise``, or ``velocity``, see
+        :class:`~sb3_causalgdp.diffusion.denoisers.Velocity`
+    :param sampling_steps: Number of the sampler's steps, None for K
+    :param denoiser: Name or class of the denoiser, see :func:`~sb3_causalgdp.diffusion.make_denoiser`
+    :param denoiser_kwargs: Further arguments of the denoiser
     """
 
     # Noise's share of the variance from which an action is adapted to a state near by
@@ -169,6 +172,9 @@ class DiffusionActor(PickledAlone, BasePolicy):
         sampler: str = "ddpm",
         ddim_eta: float = 0.0,
         prediction_type: str = "velocity",
+        sampling_steps: int | None = None,
+        denoiser: str | type[nn.Module] = "mlp",
+        denoiser_kwargs: dict[str, Any] | None = None,
     ) -> None:
         super().__init__(
             observation_space,
@@ -177,20 +183,26 @@ class DiffusionActor(PickledAlone, BasePolicy):
             normalize_images=normalize_images,
             squash_output=True,
         )
-        check_sampler(sampler, ddim_eta)
+        check_sampler(sampler, ddim_eta, sampling_steps)
         self.action_dim = get_action_dim(action_space)
         self.net_arch = net_arch
         self.features_dim = features_dim
         self.activation_fn = activation_fn
         self.sampler = sampler
         self.ddim_eta = ddim_eta
+        self.sampling_steps = sampling_steps
+        self.denoiser_kwargs = denoiser_kwargs
         self.schedule = NoiseSchedule(noise_schedule, diffusion_steps)
+        self.n_noises = diffusion_steps if sampling_steps is None else sampling_steps
+        # A denoiser that is asked between its steps learns what is between them
+        self.is_continuous = self.n_noises != diffusion_steps
         noisy_enough = (i for i, signal in enumerate(self.schedule.alpha_bar_list) if 1.0 - signal >= self.ADAPTING_NOISE)
         self.adapting_step = next(noisy_enough, self.schedule.n_steps - 1)
         self.prediction_type = prediction_type
         alpha_bar = self.schedule.alpha_bar if prediction_type == "velocity" else None
-        self.denoiser = MLPDenoiser(
-            self.action_dim, features_dim, diffusion_steps, net_arch, activation_fn, alpha_bar=alpha_bar
+        self.denoiser_class = denoiser
+        self.denoiser = make_denoiser(
+            denoiser, self.action_dim, features_dim, diffusion_steps, net_arch, activation_fn, denoiser_kwargs, alpha_bar
         )
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
@@ -205,6 +217,9 @@ class DiffusionActor(PickledAlone, BasePolicy):
             sampler=self.sampler,
             ddim_eta=self.ddim_eta,
             prediction_type=self.prediction_type,
+            sampling_steps=self.sampling_steps,
+            denoiser=self.denoiser_class,
+            denoiser_kwargs=self.denoiser_kwargs,
         )
         return data
 
@@ -227,7 +242,7 @@ class DiffusionActor(PickledAlone, BasePolicy):
         Denoise actions, see :func:`sb3_causalgdp.diffusion.sample`.
 
         :param features: Shape ``(batch, features_dim)``
-        :param noise: Shape ``(K, batch, d)``, drawn if None
+        :param noise: Shape ``(sampling_steps, batch, d)``, drawn if None
         :param guidance: Causal guidance, None for none
         :param rule: How the guidance enters a step
         :param divergences: If a list, each guided step appends its KL divergence
@@ -240,8 +255,10 @@ class DiffusionActor(PickledAlone, BasePolicy):
             guidance,
             rule,
             noise=noise,
+            action_dim=self.action_dim,
             sampler=self.sampler,
             eta=self.ddim_eta,
+            n_steps=self.sampling_steps,
             divergences=divergences,
         )
 
@@ -260,7 +277,7 @@ class DiffusionActor(PickledAlone, BasePolicy):
 
     def forward(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         features = self.features(observation)
-        shape = (self.schedule.n_steps, len(features), self.action_dim)
+        shape = (self.n_noises, len(features), self.action_dim)
         return self.sample(features, th.zeros(shape, device=features.device) if deterministic else None)
 
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:

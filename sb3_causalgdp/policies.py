@@ -60,10 +60,15 @@ class CausalGDPPolicy(SavedPolicy):
     :param world_model_net_arch: Hidden layers of the world model, all of one size, ``[128, 128]`` by default
     :param diffusion_steps: Number of diffusion steps K
     :param noise_schedule: ``vp``, ``linear`` or ``cosine``
-    :param sampler: ``ddpm`` or ``ddim``
+    :param sampler: One of :data:`~sb3_causalgdp.diffusion.SAMPLERS`
     :param ddim_eta: Noise of DDIM, in [0, 1]
-    :param prediction_type: What the denoiser predicts, ``noise`` or ``velocity``, see
-        :class:`~sb3_causalgdp.diffusion.MLPDenoiser`
+    :param prediction_type: What a named denoiser predicts, ``noise`` or ``velocity``, see
+        :class:`~sb3_causalgdp.diffusion.denoisers.Velocity`
+    :param sampling_steps: Number of the sampler's steps, None for K. With another number the denoiser learns, and is asked, at
+        all times between the diffusion steps
+    :param denoiser: ``mlp``, ``residual_mlp``, ``transformer``, or a class of your own, see
+        :func:`~sb3_causalgdp.diffusion.make_denoiser`
+    :param denoiser_kwargs: Further arguments of the denoiser
     :param guidance: ``posterior``, ``score``, ``normalized``, or None for no guidance
     :param guidance_covariance: ``tweedie``, ``isotropic`` or ``unit_gaussian``, see
         :class:`~sb3_causalgdp.diffusion.GuidanceRule`
@@ -108,6 +113,9 @@ class CausalGDPPolicy(SavedPolicy):
         sampler: str = "ddpm",
         ddim_eta: float = 0.0,
         prediction_type: str = "velocity",
+        sampling_steps: int | None = None,
+        denoiser: str | type[nn.Module] = "mlp",
+        denoiser_kwargs: dict[str, Any] | None = None,
         guidance: str | None = "posterior",
         guidance_covariance: str = "unit_gaussian",
         guidance_target: str = "return",
@@ -170,6 +178,9 @@ class CausalGDPPolicy(SavedPolicy):
             "sampler": sampler,
             "ddim_eta": ddim_eta,
             "prediction_type": prediction_type,
+            "sampling_steps": sampling_steps,
+            "denoiser": denoiser,
+            "denoiser_kwargs": denoiser_kwargs,
         }
         self.actor_kwargs = {**shared_kwargs, "net_arch": actor_arch, **self.diffusion_kwargs}
         self.critic_kwargs = {
@@ -203,10 +214,11 @@ class CausalGDPPolicy(SavedPolicy):
             self.critic_target = self.make_critic(self.actor_target.features_extractor if shared else None)
             self.critic_target.load_state_dict(self.critic.state_dict())
         self._check_guidance_steps()
+        self._check_attention()
 
         self.world_model = MaskedWorldModel(self._state_dim(), self.actor.action_dim, self.world_model_net_arch)
         # Of deterministic predictions
-        noise = fixed_noise(self.actor.schedule.n_steps, self.n_action_candidates, self.actor.action_dim)
+        noise = fixed_noise(self.actor.n_noises, self.n_action_candidates, self.actor.action_dim)
         self.register_buffer("candidate_noise", noise, persistent=False)
 
         optimizer_kwargs = self.optimizer_kwargs
@@ -236,6 +248,27 @@ class CausalGDPPolicy(SavedPolicy):
                 f"guidance_scale must be one number or one for each of the {n_steps} diffusion steps, "
                 f"got {len(self.guidance_rule.scales)} values"
             )
+
+    def _check_attention(self) -> None:
+        if not getattr(self.actor.denoiser, "causal", False):
+            return
+        extractor = self.actor.features_extractor
+        plain = type(extractor) in (FlattenExtractor, CombinedExtractor, StandardizedExtractor)
+        if self.has_image_state or not plain:
+            raise ValueError(
+                "denoiser_kwargs={'causal': True} needs observations that are vectors and no features extractor, got "
+                f"{type(extractor).__name__} for {self.observation_space}"
+            )
+
+    def set_attention(self, masks: Sequence[th.Tensor]) -> None:
+        """
+        Let a denoiser look along a causal graph, where it was made to.
+
+        :param masks: As :meth:`~sb3_causalgdp.causal.MaskedWorldModel.set_masks` takes them
+        """
+        for actor in (self.actor, self.actor_target):
+            if getattr(actor.denoiser, "causal", False):
+                actor.denoiser.set_graph(*masks)  # type: ignore[operator]
 
     def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> DiffusionActor:
         return DiffusionActor(**self._update_features_extractor(self.actor_kwargs, features_extractor)).to(self.device)

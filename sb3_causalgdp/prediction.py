@@ -68,10 +68,10 @@ def fixed_noise(n_steps: int, n_candidates: int, action_dim: int) -> th.Tensor:
     """
     Noise of deterministic predictions.
 
-    :param n_steps: Number of diffusion steps K
+    :param n_steps: Number of the sampler's steps
     :param n_candidates: Number of candidates N
     :param action_dim: Size of an action
-    :return: None for the first candidate, the same at every call for the others, shape ``(K, N, d)``
+    :return: None for the first candidate, the same at every call for the others, shape ``(n_steps, N, d)``
     """
     noise = th.randn((n_steps, n_candidates, action_dim), generator=th.Generator().manual_seed(0))
     noise[:, 0] = 0.0
@@ -83,7 +83,7 @@ def candidate_noise(policy: Policy, n_observations: int, deterministic: bool) ->
     :param policy: The policy
     :param n_observations: Number of observations
     :param deterministic: Whether it is the same at every call
-    :return: Noise of each observation's candidates, shape ``(K, n_observations * N, d)``
+    :return: Noise of each observation's candidates, shape ``(n_steps, n_observations * N, d)``
     """
     fixed = policy.candidate_noise
     if deterministic:

@@ -302,9 +302,10 @@ class Updates:
                     predicted, _ = self.world_model.predict_next_state(state, transitions.actions)
                 next_state = th.where(transitions.dones > 0.0, predicted, next_state)
             guidance = self.policy.make_guidance(state, next_state, next_actions, climbed)
-        denoising = denoising_loss(self.actor.denoiser, self.actor.schedule, features, transitions.actions, guidance, rule)
-        actions = denoising.clean_actions if self.model.actor_update == "one_step" else self.actor.sample(features)
-        return denoising, self.q_term(observations, actions, transitions.actions, climbed)
+        actor, of_data = self.actor, transitions.actions
+        denoising = denoising_loss(actor.denoiser, actor.schedule, features, of_data, guidance, rule, actor.is_continuous)
+        actions = denoising.clean_actions if self.model.actor_update == "one_step" else actor.sample(features)
+        return denoising, self.q_term(observations, actions, of_data, climbed)
 
     def q_term(self, observations, actions: th.Tensor, of_data: th.Tensor, climbed: int) -> th.Tensor:
         """

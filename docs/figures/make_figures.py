@@ -266,6 +266,85 @@ def draw_guidance_error() -> Figure:
     return figure
 
 
+# Samplers ---------------------------------------------------------------------------------------------------------------
+
+SAMPLER_STEPS = (3, 5, 10, 20, 40)
+SAMPLER_COLOURS = {"ddpm": GREY, "ddim": ORANGE, "euler_maruyama": BLUE, "heun": RED, "dpm_solver": GREEN}
+
+
+def posterior_distance(system: LinearGaussian, schedule: NoiseSchedule, sampler: str) -> float:
+    """Wasserstein distance of guided samples from the posterior, in standard deviations of the prior."""
+    n_noises = 3 * schedule.n_steps
+    noise = th.cat([th.zeros(1, n_noises, dtype=th.float64), th.eye(n_noises, dtype=th.float64)])
+    noise = noise.view(n_noises + 1, schedule.n_steps, 3).transpose(0, 1)
+    rule = GuidanceRule("posterior", "tweedie")
+    # A sample is affine in its noise, so its mean and covariance can be read off
+    ends = sample(
+        system.denoiser(schedule), schedule, noise[0], system.guidance, rule, noise=noise, clip=None, sampler=sampler
+    )
+    prior_precision = th.linalg.inv(system.covariance)
+    covariance = th.linalg.inv(prior_precision + system.curvature)
+    mean = covariance @ (prior_precision @ system.mean + system.observe.T @ system.precision @ system.outcome)
+    root = th.linalg.inv(th.linalg.cholesky(system.covariance))
+    columns = (ends[1:] - ends[0]) @ root.T
+    ours, exact = columns.T @ columns, root @ covariance @ root.T
+    product = th.linalg.eigvals(ours @ exact).real.clamp(min=0.0).sqrt().sum()
+    return float(
+        ((root @ (ends[0] - mean)).square().sum() + ours.trace() + exact.trace() - 2.0 * product).clamp(min=0.0).sqrt()
+    )
+
+
+def mixture_distance(schedule: NoiseSchedule, sampler: str, n_samples: int = 4_000) -> float:
+    """Wasserstein distance of samples from a policy with two modes."""
+    weights, means, stds = th.tensor([0.4, 0.6]), th.tensor([-0.6, 0.5]), th.tensor([0.1, 0.15])
+
+    def predict(noisy: th.Tensor, step: int | th.Tensor, condition: th.Tensor) -> th.Tensor:
+        alpha_bar = schedule.alpha_bar_list[int(step)]
+        centred, variances = noisy - alpha_bar**0.5 * means, alpha_bar * stds**2 + 1.0 - alpha_bar
+        share = (weights.log() - 0.5 * centred**2 / variances - 0.5 * variances.log()).softmax(dim=1)
+        return (1.0 - alpha_bar) ** 0.5 * (share * centred / variances).sum(dim=1, keepdim=True)
+
+    th.manual_seed(0)
+    ends = sample(predict, schedule, th.zeros(n_samples, 1), action_dim=1, sampler=sampler)
+    grid = th.linspace(-1.5, 1.5, 3_001)
+    of_samples = th.searchsorted(ends[:, 0].sort().values, grid) / n_samples
+    exact = (weights * th.distributions.Normal(means, stds).cdf(grid[:, None])).sum(dim=1)
+    return float((of_samples - exact).abs().mean() * 3.0)
+
+
+def draw_samplers() -> Figure:
+    figure = new_figure(9.6, 3.3)
+    systems = [LinearGaussian(seed) for seed in range(N_SYSTEMS)]
+    panels: dict[str, Callable[[int, str], float]] = {
+        "guided, vp": lambda n, name: float(
+            np.median([posterior_distance(one, NoiseSchedule("vp", n), name) for one in systems])
+        ),
+        "guided, cosine": lambda n, name: float(
+            np.median([posterior_distance(one, NoiseSchedule("cosine", n), name) for one in systems])
+        ),
+        "two modes, vp": lambda n, name: mixture_distance(NoiseSchedule("vp", n), name),
+    }
+    for index, (title, distance) in enumerate(panels.items()):
+        axes = figure.add_subplot(1, 3, index + 1)
+        for sampler, colour in SAMPLER_COLOURS.items():
+            # Heun asks the denoiser twice in all steps but the last
+            costs = [2 * n - 1 if sampler == "heun" else n for n in SAMPLER_STEPS]
+            axes.plot(
+                costs, [distance(n, sampler) for n in SAMPLER_STEPS], color=colour, marker="o", markersize=3, label=sampler
+            )
+        ticks = (3, 5, 10, 20, 40, 80)
+        axes.set(xscale="log", yscale="log")
+        axes.set_xticks(ticks, [str(tick) for tick in ticks])
+        axes.minorticks_off()
+        axes.set_title(title, fontsize=9)
+        axes.set_xlabel("evaluations of the denoiser", fontsize=9)
+        axes.spines[["top", "right"]].set_visible(False)
+        if index == 0:
+            axes.set_ylabel("Wasserstein distance\nfrom what is exact", fontsize=9)
+    figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=5, fontsize=8, frameon=False)
+    return figure
+
+
 # Graphs of real environments --------------------------------------------------------------------------------------------
 
 
@@ -442,6 +521,7 @@ FIGURES: dict[str, Callable[[], Figure]] = {
     "denoising_chain": draw_denoising_chain,
     "guidance_error": draw_guidance_error,
     "noise_schedules": draw_noise_schedules,
+    "samplers": draw_samplers,
     "pendulum_graph": draw_pendulum_graph,
     "halfcheetah_effects": draw_halfcheetah_effects,
     "halfcheetah_graph": draw_halfcheetah_graph,

@@ -32,6 +32,7 @@ from sb3_causalgdp.acceleration.numpy_networks import (
     without_norms,
 )
 from sb3_causalgdp.diffusion import MLPDenoiser
+from sb3_causalgdp.diffusion.plans import sampling_points
 from sb3_causalgdp.extractors import StandardizedExtractor
 
 Policy = Any  # a CausalGDPPolicy, whose file imports this one
@@ -95,7 +96,8 @@ class NumpyActing:
         self.world_model = WorldModel(near.world_model)
         self.return_std, self.reward_target = view(near.return_std), view(near.reward_target)
         rule = policy.guidance_rule
-        self.rule = None if rule is None else Rule(rule, policy.actor.schedule, policy.actor.action_dim)
+        points = sampling_points(policy.actor.schedule, policy.actor.sampling_steps)
+        self.rule = None if rule is None else Rule(rule, points, policy.actor.action_dim)
         self._blas = ThreadpoolController().select(user_api="blas")
         self._modules = _networks_of(policy)
         self._tensors = HostCopy.tensors_of(policy)
@@ -120,6 +122,8 @@ class NumpyActing:
         :return: Whether this class can act for it: vectors of observations as they are, plain layers in float32 on a CPU or a
             GPU of CUDA, and a guidance without the denoiser's Jacobian
         """
+        if type(policy.actor.denoiser) is not MLPDenoiser:
+            return False
         rule, activation = policy.guidance_rule, policy.activation_fn
         critics = (without_norms(without_batch_norms(network)[0])[0] for network in policy.critic_target.q_networks)
         networks: list[Any] = [policy.actor.denoiser.network, *critics]
@@ -130,7 +134,6 @@ class NumpyActing:
             and not policy.has_image_state
             and _shows_vectors(policy.actor.features_extractor)
             and _shows_vectors(policy.critic_target.features_extractor)
-            and type(policy.actor.denoiser) is MLPDenoiser
             and activation in ACTIVATIONS
             and all(has_plain_layers(network, activation) for network in networks)
             and all(parameter.dtype == th.float32 for parameter in policy.parameters())
@@ -157,7 +160,7 @@ class NumpyActing:
         n_candidates = policy.n_action_candidates
         features = self.features(state.T)
         time_part = self.denoiser.time_part()
-        bound = self.denoiser.bind(features, time_part)
+        bound = self.denoiser.bind(features, self.denoiser.at_points(time_part))
         noise = noise.transpose(0, 2, 1)
         repeated = bound if n_candidates == 1 else np.repeat(bound, n_candidates, axis=2)
         start, scaled_noise = noise[0], self.denoiser.scaled(noise)

@@ -11,8 +11,8 @@ from torch import nn
 
 from sb3_causalgdp.acceleration.activations import fast
 from sb3_causalgdp.causal.world_model import MaskedBlocks, MaskedWorldModel
-from sb3_causalgdp.diffusion import GuidanceRule, NoiseSchedule
-from sb3_causalgdp.diffusion.samplers import transition_weights
+from sb3_causalgdp.diffusion import GuidanceRule
+from sb3_causalgdp.diffusion.plans import Point, Stage, sampling_plan, sampling_points
 from sb3_causalgdp.extractors import StandardizedExtractor
 
 Policy = Any  # a CausalGDPPolicy, whose file imports this one
@@ -173,31 +173,39 @@ def _normalises(module: nn.Module, layer: nn.Linear) -> bool:
     return module.weight is not None and module.bias is not None
 
 
-class _ReverseStep:
-    """The coefficients of a diffusion step."""
+class _Move:
+    """The coefficients of a stage of a sampler."""
 
-    def __init__(self, schedule: NoiseSchedule, step: int, eta: float, predicts_velocity: bool) -> None:
-        alpha_bar = schedule.alpha_bar_list[step]
+    def __init__(self, stage: Stage, predicts_velocity: bool) -> None:
+        alpha_bar = stage.alpha_bar
         # a0_hat = clean_by_noisy a^k - clean_by_output (what the network gives: the noise or the velocity)
         self.clean_by_noisy = _constant(alpha_bar ** (0.5 if predicts_velocity else -0.5))
         self.clean_by_output = _constant((1.0 - alpha_bar if predicts_velocity else 1.0 / alpha_bar - 1.0) ** 0.5)
-        self.signal = _constant(alpha_bar**0.5)
-        by_clean, by_noisy, self.std = transition_weights(schedule, step, eta)
-        self.by = _constant(by_clean), _constant(by_noisy)
-        self.is_last = step == 0
+        self.std = stage.std
+        self.by = _constant(stage.by_clean), _constant(stage.by_noisy)
+        self.by_previous = _constant(stage.by_previous_clean), _constant(stage.by_previous_noisy)
+        self.reads_previous = stage.by_previous_clean != 0.0 or stage.by_previous_noisy != 0.0
+        self.is_last = stage.is_last
 
     def clean(self, noisy_action: np.ndarray, predicted: np.ndarray) -> np.ndarray:
         """The estimate of the clean action, not clipped."""
         return self.clean_by_noisy * noisy_action - self.clean_by_output * predicted
 
-    def next(self, clean: np.ndarray, noisy_action: np.ndarray, scaled_noise: np.ndarray) -> np.ndarray:
+    def next(
+        self, clean: np.ndarray, noisy_action: np.ndarray, scaled_noise: np.ndarray, previous: tuple[np.ndarray, np.ndarray]
+    ) -> np.ndarray:
         """From a^k to a^(k-1); the noise has the step's standard deviation."""
         if self.is_last:
             return clean
         by_clean, by_noisy = self.by
         action = by_clean * clean
         action += by_noisy * noisy_action
-        action += scaled_noise
+        if self.reads_previous:
+            by_clean, by_noisy = self.by_previous
+            action += by_clean * previous[0]
+            action += by_noisy * previous[1]
+        if self.std > 0.0:
+            action += scaled_noise
         return action
 
 
@@ -219,20 +227,32 @@ class Denoiser:
         self.time_table = view(denoiser.time_table).T
         self.time_layers, self.layers = _linear_layers(denoiser.time_mlp), _linear_layers(denoiser.network)
         self.activation = ACTIVATIONS[actor.activation_fn].value
-        eta = 1.0 if actor.sampler == "ddpm" else actor.ddim_eta
-        n_steps = actor.schedule.n_steps
-        self.steps = [_ReverseStep(actor.schedule, k, eta, denoiser.predicts_velocity) for k in range(n_steps)]
-        # From the last step to the first; the one at position p scales the noise of row p + 1, and the very last one none
-        self.chain = [(k, self.steps[k]) for k in reversed(range(n_steps))]
-        self.stds = np.array([step.std for _, step in self.chain], dtype=np.float32)[:, None, None]
-        self.noise_rows = np.roll(np.arange(n_steps), -1)
+        schedule, predicts_velocity = actor.schedule, denoiser.velocity is not None
+        stages = sampling_plan(schedule, actor.sampler, actor.ddim_eta, actor.sampling_steps)
+        # The stage at position p scales the noise of row p + 1, and the very last one none
+        self.chain = [(stage.point, _Move(stage, predicts_velocity)) for stage in stages]
+        self.stds = np.array([stage.std for stage in stages], dtype=np.float32)[:, None, None]
+        self.noise_rows = np.minimum(np.arange(1, len(stages) + 1), actor.n_noises - 1)
+        steps = np.array([point.step for point in sampling_points(schedule, actor.sampling_steps)])
+        self.is_trained_grid = np.array_equal(steps, np.arange(schedule.n_steps))
+        self.lower = steps.astype(int)
+        self.upper = np.minimum(self.lower + 1, schedule.n_steps - 1)
+        self.share = (steps - self.lower).astype(np.float32)[:, None, None]
         self.adapting_step = actor.adapting_step
+        self.adapting = _Move(sampling_plan(schedule, "ddim")[-1 - actor.adapting_step], predicts_velocity)
+        self.adapting_signal = _constant(schedule.alpha_bar_list[actor.adapting_step] ** 0.5)
 
     def time_part(self) -> np.ndarray:
         """The diffusion steps' part of the first layer, bias included, shape ``(K, width, 1)``."""
         (weight, bias), (last_weight, last_bias) = self.time_layers
         embedding = last_weight @ ACTIVATIONS[nn.Mish].value(weight @ self.time_table + bias) + last_bias
         return (self.time_weight @ embedding + self.bias).T[:, :, None]
+
+    def at_points(self, time_part: np.ndarray) -> np.ndarray:
+        """The same at the times of the sampler's grid, which may be between the diffusion steps."""
+        if self.is_trained_grid:
+            return time_part
+        return time_part[self.lower] + self.share * (time_part[self.upper] - time_part[self.lower])
 
     def bind(self, features: np.ndarray, time_part: np.ndarray) -> np.ndarray:
         """The first layer without the noisy action's part, for each diffusion step, shape ``(K, width, batch)``."""
@@ -248,7 +268,7 @@ class Denoiser:
         return hidden
 
     def scaled(self, noise: np.ndarray) -> np.ndarray:
-        """What each diffusion step adds of the noise, in the order of the chain, shape ``(K, d, batch)``."""
+        """What each stage adds of the noise, in the order of the chain, shape ``(stages, d, batch)``."""
         return self.stds * noise[self.noise_rows]
 
     def sample(
@@ -264,21 +284,22 @@ class Denoiser:
         says of the start does not depend on the guidance, so a second chain need not ask again. ``shift`` says by how much the
         guidance moves a clean estimate.
         """
-        predicted = first_prediction
-        for position, (k, step) in enumerate(self.chain):
+        predicted, previous = first_prediction, (action, action)
+        for position, (point, move) in enumerate(self.chain):
             if predicted is None:
-                predicted = self.predict(action, bound[k])
-            clean = step.clean(action, predicted)
+                predicted = self.predict(action, bound[point])
+            clean = move.clean(action, predicted)
             if shift is not None:
-                clean += shift(_clip(clean), k)
-            action, predicted = step.next(_clip(clean), action, scaled_noise[position]), None
+                clean += shift(_clip(clean), point)
+            clean = _clip(clean)
+            following = move.next(clean, action, scaled_noise[position], previous)
+            previous, action, predicted = (clean, action), following, None
         return action
 
     def adapt(self, features: np.ndarray, action: np.ndarray, time_part: np.ndarray) -> np.ndarray:
         """:meth:`DiffusionActor.adapt`, features of shape ``(n, batch)``, actions ``(d, batch)``."""
-        step = self.steps[self.adapting_step]
-        noisy = step.signal * action
-        return _clip(step.clean(noisy, self.predict(noisy, self.bind(features, time_part[self.adapting_step]))))
+        noisy = self.adapting_signal * action
+        return _clip(self.adapting.clean(noisy, self.predict(noisy, self.bind(features, time_part[self.adapting_step]))))
 
 
 class Features:
@@ -474,12 +495,14 @@ class WorldModel:
 class Rule:
     """``GuidanceRule`` for a guidance that is linear in the clean action."""
 
-    def __init__(self, rule: GuidanceRule, schedule: NoiseSchedule, action_dim: int) -> None:
+    def __init__(self, rule: GuidanceRule, points: Sequence[Point], action_dim: int) -> None:
         self.mode = rule.mode
         self.identity = np.eye(action_dim, dtype=np.float32)
-        alpha_bar = np.array(schedule.alpha_bar_list, dtype=np.float32)[:, None, None, None]
+        alpha_bar = np.array([point.alpha_bar for point in points], dtype=np.float32)[:, None, None, None]
         self.noise = 1.0 - alpha_bar
-        scales = np.asarray(rule.scales, dtype=np.float32).reshape(-1, 1, 1, 1)
+        steps = [point.step for point in points]
+        each = np.interp(steps, range(len(rule.scales)), rule.scales) if len(rule.scales) > 1 else rule.scales
+        scales = np.asarray(each, dtype=np.float32).reshape(-1, 1, 1, 1)
         # Taking sqrt(1 - alpha_bar) G off the noise adds (1 - alpha_bar) / sqrt(alpha_bar) G to the clean estimate
         self.factor = scales * (self.noise if rule.mode == "posterior" else self.noise / np.sqrt(alpha_bar))
 
@@ -490,7 +513,8 @@ class Rule:
         :param best: The action at which the guidance was taken, shape ``(batch, d)``
         :param gradient: Shape ``(batch, d)``
         :param curvature: Shape ``(batch, d, d)``
-        :return: Gives the shift of a clean action and a diffusion step, both of shape ``(d, batch)``
+        :return: Gives the shift of a clean action at a point of the sampler's grid; both actions have the shape
+            ``(d, batch)``
         """
         # The guidance at the clean action 0; the diffusion steps' factors are found for all of them at once
         at_zero = gradient[:, :, None] + curvature @ best[:, :, None]

@@ -6,10 +6,13 @@ from typing import Protocol
 import numpy as np
 import torch as th
 
-from sb3_causalgdp.diffusion.schedules import NoiseSchedule
+from sb3_causalgdp.diffusion.schedules import NoiseSchedule, at_step
 
-NoisePredictor = Callable[[th.Tensor, int | th.Tensor], th.Tensor]
-"""Predicts the noise, shape ``(batch, d)``, from the noisy action and the index of the diffusion step."""
+NoisePredictor = Callable[[th.Tensor, int | float | th.Tensor], th.Tensor]
+"""
+Predicts the noise, shape ``(batch, d)``, from the noisy action and the diffusion step: an index, or, where a sampler takes
+other steps than the schedule's, a floating point number between two.
+"""
 
 GUIDANCE_MODES = ("posterior", "score", "normalized")
 GUIDANCE_COVARIANCES = ("tweedie", "isotropic", "unit_gaussian")
@@ -77,15 +80,15 @@ class GuidanceRule:
         """Whether the guided chain is that of a posterior, which asks for no smaller steps than the chain of the prior."""
         return self.mode == "posterior" and max(self.scales) <= 1.0
 
-    def scale_at(self, step: int | th.Tensor, reference: th.Tensor) -> th.Tensor:
+    def scale_at(self, step: int | float | th.Tensor, reference: th.Tensor) -> th.Tensor:
         """
-        :param step: Index of the diffusion step, ``0..K-1``: one, or shape ``(batch,)``
+        :param step: Diffusion step in [0, K-1], an index or a number between two: one, or shape ``(batch,)``
         :param reference: Tensor whose device and type the result takes
         :return: lambda_k, shape ``(1, 1)`` or ``(batch, 1)``
         """
         # Made on the device: to copy them there would be to wait for it
         scales = [th.full((1,), scale, dtype=reference.dtype, device=reference.device) for scale in self.scales]
-        return (scales[0] if len(scales) == 1 else th.cat(scales)[step]).reshape(-1, 1)
+        return (scales[0] if len(scales) == 1 else at_step(th.cat(scales), step)).reshape(-1, 1)
 
     def __call__(
         self,
@@ -135,7 +138,7 @@ def guidance_shift(
     schedule: NoiseSchedule,
     noisy_action: th.Tensor,
     noise: th.Tensor,
-    step: int | th.Tensor,
+    step: int | float | th.Tensor,
     clip: float | None = 1.0,
 ) -> th.Tensor:
     """
@@ -149,11 +152,11 @@ def guidance_shift(
     :param schedule: Noise schedule
     :param noisy_action: a^k, shape ``(batch, d)``
     :param noise: The noise that the denoiser predicts for it, shape ``(batch, d)``
-    :param step: Index of the diffusion step, ``0..K-1``: one for all, or shape ``(batch,)``
+    :param step: Diffusion step in [0, K-1], an index or a number between two: one for all, or shape ``(batch,)``
     :param clip: Bound of the actions at which the guidance is evaluated, None for no bound
     :return: The shift, shape ``(batch, d)``, without a graph
     """
-    alpha_bar = schedule.alpha_bar[step].reshape(-1, 1).to(noisy_action.dtype)
+    alpha_bar = schedule.signal_left(step).to(noisy_action.dtype)
     clean = (noisy_action - (1.0 - alpha_bar).sqrt() * noise) / alpha_bar.sqrt()
     gradient, curvature = guidance(clean if clip is None else clean.clamp(-clip, clip))
     jacobian = clean_estimate_jacobian(predict_noise, noisy_action, step, alpha_bar) if rule.needs_jacobian else None
@@ -164,7 +167,7 @@ def guidance_shift(
 def clean_estimate_jacobian(
     predict_noise: NoisePredictor,
     noisy_action: th.Tensor,
-    step: int | th.Tensor,
+    step: int | float | th.Tensor,
     alpha_bar: th.Tensor,
 ) -> th.Tensor:
     """
@@ -172,7 +175,7 @@ def clean_estimate_jacobian(
 
     :param predict_noise: The denoiser, bound to its condition
     :param noisy_action: a^k, shape ``(batch, d)``
-    :param step: Index of the diffusion step, ``0..K-1``: one for all, or shape ``(batch,)``
+    :param step: Diffusion step in [0, K-1], an index or a number between two: one for all, or shape ``(batch,)``
     :param alpha_bar: Share of signal left, shape ``(batch, 1)`` or ``(1, 1)``
     :return: Shape ``(batch, d, d)``; entry ``[b, i, j]`` is the derivative of a0_hat_i by a^k_j
     """

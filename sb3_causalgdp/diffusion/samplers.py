@@ -8,20 +8,28 @@ import torch as th
 
 from sb3_causalgdp.diffusion.bounds import bounded
 from sb3_causalgdp.diffusion.guidance import Guidance, GuidanceRule, NoisePredictor, guidance_shift
+from sb3_causalgdp.diffusion.plans import SAMPLERS, SPACINGS, Stage, ancestral_std, sampling_plan, sampling_points
 from sb3_causalgdp.diffusion.schedules import NoiseSchedule
 
-Denoiser = Callable[[th.Tensor, int | th.Tensor, th.Tensor], th.Tensor]
-"""Predicts the noise, shape ``(batch, d)``, from the noisy action, the index of the diffusion step and the condition."""
+Denoiser = Callable[[th.Tensor, int | float | th.Tensor, th.Tensor], th.Tensor]
+"""
+Predicts the noise, shape ``(batch, d)``, from the noisy action, the diffusion step and the condition. The step is an index;
+where a sampler takes other steps than the schedule's, a floating point number between two.
+"""
 
-SAMPLERS = ("ddpm", "ddim")
 
-
-def check_sampler(sampler: str, eta: float) -> None:
+def check_sampler(sampler: str, eta: float, n_steps: int | None = None, spacing: str = "time") -> None:
     """
-    :param sampler: ``ddpm`` or ``ddim``
+    :param sampler: One of :data:`~sb3_causalgdp.diffusion.SAMPLERS`
     :param eta: Noise of DDIM, in [0, 1]
-    :raises ValueError: If the name is unknown or the noise is out of range
+    :param n_steps: Number of the sampler's steps, None for the schedule's
+    :param spacing: ``time`` or ``log_snr``
+    :raises ValueError: If a name is unknown or a number is out of range
     """
+    if spacing not in SPACINGS:
+        raise ValueError(f"Unknown spacing {spacing!r}: it must be one of {list(SPACINGS)}")
+    if n_steps is not None and (isinstance(n_steps, bool) or not isinstance(n_steps, int) or n_steps < 1):
+        raise ValueError(f"sampling_steps must be an integer of at least 1 or None, got {n_steps!r}")
     if sampler not in SAMPLERS:
         raise ValueError(f"Unknown sampler {sampler!r}: it must be one of {list(SAMPLERS)}")
     if not 0.0 <= eta <= 1.0:
@@ -39,7 +47,7 @@ def bind(denoiser: Denoiser, condition: th.Tensor) -> NoisePredictor:
     return partial(_call, denoiser, condition)
 
 
-def _call(denoiser: Denoiser, condition: th.Tensor, noisy_action: th.Tensor, step: int | th.Tensor) -> th.Tensor:
+def _call(denoiser: Denoiser, condition: th.Tensor, noisy_action: th.Tensor, step: int | float | th.Tensor) -> th.Tensor:
     return denoiser(noisy_action, step, condition)
 
 
@@ -51,28 +59,7 @@ def transition_std(schedule: NoiseSchedule, step: int) -> float:
     :param step: Index of the diffusion step, ``0..K-1``
     :return: sigma_k
     """
-    if schedule.n_steps == 1:
-        return math.sqrt(schedule.beta_list[0])
-    step = max(step, 1)
-    previous, current = schedule.alpha_bar_previous_list[step], schedule.alpha_bar_list[step]
-    return math.sqrt((1.0 - previous) / (1.0 - current) * schedule.beta_list[step])
-
-
-def transition_weights(schedule: NoiseSchedule, step: int, eta: float = 1.0) -> tuple[float, float, float]:
-    """
-    A reverse step is ``a^(k-1) = by_clean a0_hat + by_noisy a^k + std z`` (Song et al., 2021, DDIM, equation 12).
-
-    :param schedule: Noise schedule
-    :param step: Index of the diffusion step, ``0..K-1``; step 0 returns the clean action, ``(1, 0, 0)``
-    :param eta: 1 is DDPM's ancestral step, 0 is deterministic
-    :return: ``by_clean``, ``by_noisy`` and ``std``
-    """
-    if step == 0:
-        return 1.0, 0.0, 0.0
-    alpha_bar, previous = schedule.alpha_bar_list[step], schedule.alpha_bar_previous_list[step]
-    std = eta * transition_std(schedule, step)
-    by_noisy = math.sqrt(1.0 - previous - std**2) / math.sqrt(1.0 - alpha_bar)
-    return math.sqrt(previous) - by_noisy * math.sqrt(alpha_bar), by_noisy, std
+    return ancestral_std(sampling_points(schedule), step)
 
 
 def denoising_step(
@@ -94,11 +81,39 @@ def denoising_step(
     :param eta: 1 is DDPM's ancestral step, 0 is deterministic
     :return: a^(k-1), shape ``(batch, d)``
     """
-    if step == 0:
+    stage = sampling_plan(schedule, "ddim", eta)[-1 - step]
+    return moved(stage, noisy_action, clean_action, noise, None, None)
+
+
+def moved(
+    stage: Stage,
+    noisy_action: th.Tensor,
+    clean_action: th.Tensor,
+    noise: th.Tensor,
+    previous_noisy: th.Tensor | None,
+    previous_clean: th.Tensor | None,
+) -> th.Tensor:
+    """
+    The move of a stage of :func:`~sb3_causalgdp.diffusion.plans.sampling_plan`.
+
+    :param stage: The stage
+    :param noisy_action: The noisy action that the denoiser saw, shape ``(batch, d)``
+    :param clean_action: Estimate of a^0, shape ``(batch, d)``
+    :param noise: Standard normal noise, shape ``(batch, d)``; read by stages with noise alone
+    :param previous_noisy: The noisy action of the stage before, None at the first
+    :param previous_clean: The clean estimate of the stage before, None at the first
+    :return: The noisy action of the next stage, or, at the last, the action, shape ``(batch, d)``
+    """
+    if stage.is_last:
         return clean_action
-    by_clean, by_noisy, std = transition_weights(schedule, step, eta)
-    mean = by_clean * clean_action + by_noisy * noisy_action
-    return mean + std * noise if std > 0.0 else mean
+    action = stage.by_clean * clean_action + stage.by_noisy * noisy_action
+    if stage.by_previous_clean != 0.0:
+        assert previous_clean is not None
+        action = action + stage.by_previous_clean * previous_clean
+    if stage.by_previous_noisy != 0.0:
+        assert previous_noisy is not None
+        action = action + stage.by_previous_noisy * previous_noisy
+    return action + stage.std * noise if stage.std > 0.0 else action
 
 
 def sample(
@@ -112,6 +127,8 @@ def sample(
     action_dim: int | None = None,
     sampler: str = "ddpm",
     eta: float = 0.0,
+    n_steps: int | None = None,
+    spacing: str = "time",
     clip: float | None = 1.0,
     divergences: list[th.Tensor] | None = None,
 ) -> th.Tensor:
@@ -125,47 +142,54 @@ def sample(
     :param observation: What the denoiser is conditioned on, shape ``(batch, condition_dim)``
     :param guidance: The log density that steers, None for the diffusion policy as it is
     :param rule: How the guidance enters a step, ``GuidanceRule()`` if None
-    :param noise: Standard normal noise, shape ``(K, batch, d)``: the start a^K, then that of the steps K..2 (DDIM without
-        noise reads the start only). Drawn if None; zeros give the noise-free chain
+    :param noise: Standard normal noise, shape ``(n_steps, batch, d)``: the start a^K, then that of all steps but the last
+        (those that draw none read the start only). Drawn if None; zeros give the noise-free chain
     :param action_dim: Number of action components, where neither ``noise`` nor the denoiser tells
-    :param sampler: ``ddpm`` or ``ddim``
+    :param sampler: ``ddpm`` and ``ddim``; ``euler_maruyama``, the reverse SDE; ``heun`` and ``dpm_solver``, methods of second
+        order for the probability-flow ODE, the first with two evaluations of the denoiser in each step, the other with one
     :param eta: Noise of DDIM: 0 is deterministic, 1 is DDPM
+    :param n_steps: Number of the sampler's steps, None for the schedule's K; others are spread over the same times, and the
+        denoiser is asked at fractions of its steps
+    :param spacing: ``time`` for evenly spaced diffusion steps, ``log_snr`` for evenly spaced logs of signal over noise
     :param clip: Bound of the clean estimate, None for no bound; gradients that point back inside pass it, see
         :func:`~sb3_causalgdp.diffusion.bounds.bounded`
     :param divergences: If a list, each guided step appends its ``||mu_cg - mu||^2 / (2 sigma_k^2)``, shape ``(batch,)``:
         their sum is KL(pi_cg || pi) of the chain (the paper's Theorem 1), with DDPM's sigma_k
     :return: Actions, shape ``(batch, d)``
     """
-    check_sampler(sampler, eta)
+    check_sampler(sampler, eta, n_steps, spacing)
     rule = GuidanceRule() if rule is None else rule
-    eta = 1.0 if sampler == "ddpm" else eta
+    n_noises = schedule.n_steps if n_steps is None else n_steps
     if noise is None:
         width = denoiser.action_dim if action_dim is None else action_dim  # type: ignore[attr-defined]
-        noise = th.randn(schedule.n_steps, len(observation), width, dtype=observation.dtype, device=observation.device)
-    if noise.ndim != 3 or noise.shape[:2] != (schedule.n_steps, len(observation)):
-        raise ValueError(f"noise must have the shape ({schedule.n_steps}, {len(observation)}, d), got {tuple(noise.shape)}")
+        noise = th.randn(n_noises, len(observation), width, dtype=observation.dtype, device=observation.device)
+    if noise.ndim != 3 or noise.shape[:2] != (n_noises, len(observation)):
+        raise ValueError(f"noise must have the shape ({n_noises}, {len(observation)}, d), got {tuple(noise.shape)}")
     if guidance is not None and len(rule.scales) not in (1, schedule.n_steps):
         raise ValueError(f"guidance_scale must hold 1 or {schedule.n_steps} values, got {len(rule.scales)}")
     predict_noise = bind(denoiser, observation)
     action = noise[0]
-    for position, step in enumerate(reversed(range(schedule.n_steps))):
-        signal = math.sqrt(schedule.alpha_bar_list[step])
-        spread = math.sqrt(1.0 - schedule.alpha_bar_list[step])
-        predicted = predict_noise(action, step)
+    previous_action = previous_clean = None
+    points = sampling_points(schedule, n_steps, spacing) if divergences is not None else []
+    for position, stage in enumerate(sampling_plan(schedule, sampler, eta, n_steps, spacing)):
+        signal, spread = math.sqrt(stage.alpha_bar), math.sqrt(1.0 - stage.alpha_bar)
+        predicted = predict_noise(action, stage.step)
         clean = (action - spread * predicted) / signal
         if guidance is not None:
-            shift = guidance_shift(guidance, rule, predict_noise, schedule, action, predicted, step, clip)
+            shift = guidance_shift(guidance, rule, predict_noise, schedule, action, predicted, stage.step, clip)
             guided = clean + (spread / signal) * shift
-            if divergences is not None:
-                divergences.append(_step_divergence(schedule, step, bounded(clean, clip), bounded(guided, clip)))
+            if divergences is not None and not stage.corrects:
+                std = ancestral_std(points, stage.point)
+                divergences.append(_step_divergence(stage, std, bounded(clean, clip), bounded(guided, clip)))
             clean = guided
-        fresh = noise[min(position + 1, schedule.n_steps - 1)]
-        action = denoising_step(schedule, step, action, bounded(clean, clip), fresh, eta)
+        clean = bounded(clean, clip)
+        fresh = noise[min(position + 1, n_noises - 1)]
+        following = moved(stage, action, clean, fresh, previous_action, previous_clean)
+        previous_action, previous_clean, action = action, clean, following
     return action
 
 
-def _step_divergence(schedule: NoiseSchedule, step: int, clean: th.Tensor, guided: th.Tensor) -> th.Tensor:
+def _step_divergence(stage: Stage, std: float, clean: th.Tensor, guided: th.Tensor) -> th.Tensor:
     """KL divergence of the guided DDPM step from the plain one: both are Gaussians with the covariance sigma_k^2 I."""
-    alpha_bar, previous = schedule.alpha_bar_list[step], schedule.alpha_bar_previous_list[step]
-    weight = math.sqrt(previous) * schedule.beta_list[step] / (1.0 - alpha_bar)
-    return (weight * (guided - clean)).detach().square().sum(dim=1) / (2.0 * transition_std(schedule, step) ** 2)
+    weight = math.sqrt(stage.previous) * stage.beta / (1.0 - stage.alpha_bar)
+    return (weight * (guided - clean)).detach().square().sum(dim=1) / (2.0 * std**2)

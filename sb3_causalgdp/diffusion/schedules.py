@@ -64,9 +64,34 @@ NOISE_SCHEDULES: dict[str, Callable[[int], th.Tensor]] = {
 }
 
 
+def at_step(table: th.Tensor, step: int | float | th.Tensor) -> th.Tensor:
+    """
+    Rows of a table that has one for each diffusion step. At a time between two steps, what is between their rows: a network
+    that was trained at the steps alone has seen nothing else.
+
+    :param table: Shape ``(K, ...)``
+    :param step: Diffusion step in [0, K-1], an index or a number between two: one, or shape ``(batch,)``
+    :return: Shape ``(...)``, or ``(batch, ...)``
+    """
+    if isinstance(step, int):
+        return table[step]
+    last = len(table) - 1
+    if isinstance(step, th.Tensor) and step.is_floating_point():
+        lower = step.floor().long().clamp(0, last)
+        weight = (step - lower).to(table.dtype).reshape(-1, *[1] * (table.ndim - 1))
+        return table[lower].lerp(table[(lower + 1).clamp(max=last)], weight)
+    if isinstance(step, float):
+        below = min(max(int(step), 0), last)
+        return table[below].lerp(table[min(below + 1, last)], step - below)
+    return table[step]
+
+
 class NoiseSchedule(nn.Module):
     """
     The coefficients of the forward process ``a^k = sqrt(alpha_bar_k) a^0 + sqrt(1 - alpha_bar_k) eps``.
+
+    With the steps as points of a time that is continuous, it is the variance-preserving SDE
+    ``da = -1/2 beta(t) a dt + sqrt(beta(t)) dw`` (Song et al., 2021), of which a step integrates beta(t) exactly.
 
     All are float32 buffers of shape ``(K,)`` that are not saved: they follow from the name and the number of steps. Index
     ``k - 1`` belongs to the paper's diffusion step ``k = 1..K``.
@@ -81,6 +106,7 @@ class NoiseSchedule(nn.Module):
     alpha_bar_previous: th.Tensor
     sqrt_alpha_bar: th.Tensor
     sqrt_one_minus_alpha_bar: th.Tensor
+    log_snr: th.Tensor
 
     def __init__(self, name: str = "vp", n_steps: int = 5) -> None:
         super().__init__()
@@ -99,6 +125,7 @@ class NoiseSchedule(nn.Module):
             "alpha_bar_previous": alpha_bar_previous,
             "sqrt_alpha_bar": alpha_bar.sqrt(),
             "sqrt_one_minus_alpha_bar": (1.0 - alpha_bar).sqrt(),
+            "log_snr": alpha_bar.log() - th.log1p(-alpha_bar),
         }
         for key, value in coefficients.items():
             self.register_buffer(key, value.float(), persistent=False)
@@ -106,6 +133,36 @@ class NoiseSchedule(nn.Module):
         self.alpha_bar_list: list[float] = alpha_bar.tolist()
         self.alpha_bar_previous_list: list[float] = alpha_bar_previous.tolist()
         self.beta_list: list[float] = betas.tolist()
+        self.log_snr_list: list[float] = coefficients["log_snr"].tolist()
+        # What the samplers made of it, by their settings
+        self.plans: dict[tuple, list] = {}
+
+    def alpha_bar_at(self, step: float) -> float:
+        """
+        Share of signal left at any time: between two diffusion steps, the log of the signal-to-noise ratio is linear in time.
+
+        :param step: Diffusion step, a fraction between two indices, in [0, K-1]
+        :return: alpha_bar
+        """
+        below = min(max(int(step), 0), self.n_steps - 1)
+        share = step - below
+        if share <= 0.0 or below == self.n_steps - 1:
+            return self.alpha_bar_list[below]
+        log_snr = (1.0 - share) * self.log_snr_list[below] + share * self.log_snr_list[below + 1]
+        return 1.0 / (1.0 + math.exp(-log_snr))
+
+    def signal_left(self, step: int | float | th.Tensor) -> th.Tensor:
+        """
+        :meth:`alpha_bar_at` as a tensor.
+
+        :param step: Diffusion step in [0, K-1]: an index, a fraction between two, or a tensor of either of shape ``(batch,)``
+        :return: alpha_bar, shape ``(1, 1)`` or ``(batch, 1)``
+        """
+        if isinstance(step, float):
+            return th.full((1, 1), self.alpha_bar_at(step), dtype=self.alpha_bar.dtype, device=self.alpha_bar.device)
+        if not isinstance(step, th.Tensor) or not step.is_floating_point():
+            return self.alpha_bar[step].reshape(-1, 1)
+        return th.sigmoid(at_step(self.log_snr, step)).reshape(-1, 1)
 
     def add_noise(self, action: th.Tensor, noise: th.Tensor, step: th.Tensor) -> th.Tensor:
         """
@@ -113,9 +170,12 @@ class NoiseSchedule(nn.Module):
 
         :param action: Clean actions a^0, shape ``(batch, d)``
         :param noise: Standard normal noise, shape ``(batch, d)``
-        :param step: Index of the diffusion step, ``0..K-1``, shape ``(batch,)``
+        :param step: Diffusion step in [0, K-1]: indices, or floating point numbers between them, shape ``(batch,)``
         :return: Noisy actions a^k, shape ``(batch, d)``
         """
+        if step.is_floating_point():
+            alpha_bar = self.signal_left(step)
+            return alpha_bar.sqrt() * action + (1.0 - alpha_bar).sqrt() * noise
         return self.sqrt_alpha_bar[step].unsqueeze(1) * action + self.sqrt_one_minus_alpha_bar[step].unsqueeze(1) * noise
 
     def clean_estimate(self, noisy_action: th.Tensor, noise: th.Tensor, step: th.Tensor) -> th.Tensor:
@@ -124,9 +184,12 @@ class NoiseSchedule(nn.Module):
 
         :param noisy_action: a^k, shape ``(batch, d)``
         :param noise: Predicted noise, shape ``(batch, d)``
-        :param step: Index of the diffusion step, ``0..K-1``, shape ``(batch,)``
+        :param step: Diffusion step in [0, K-1]: indices, or floating point numbers between them, shape ``(batch,)``
         :return: Estimate of the clean action, shape ``(batch, d)``
         """
+        if step.is_floating_point():
+            alpha_bar = self.signal_left(step)
+            return (noisy_action - (1.0 - alpha_bar).sqrt() * noise) / alpha_bar.sqrt()
         return (noisy_action - self.sqrt_one_minus_alpha_bar[step].unsqueeze(1) * noise) / self.sqrt_alpha_bar[step].unsqueeze(
             1
         )

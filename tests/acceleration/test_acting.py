@@ -11,13 +11,16 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_causalgdp import CausalGDP
 from sb3_causalgdp.acceleration.acting import NumpyActing
+from sb3_causalgdp.diffusion import SAMPLERS
 from sb3_causalgdp.offline.replay import SpacesEnv
 from sb3_causalgdp.prediction import act, act_in_torch, candidate_noise
 
 N_STATES, N_ACTIONS = 5, 3
 
 
-def make_policy(seed=0, observation_space=None, net_arch=(16, 16), activation_fn="relu", critic_normalization=None, **kwargs):
+def make_policy(
+    seed=0, observation_space=None, net_arch=(16, 16), activation_fn="relu", critic_normalization=None, more=None, **kwargs
+):
     """A policy whose weights, masks and statistics are all different from their start values, and whose guidance is on."""
     observation_space = observation_space or spaces.Box(-3.0, 3.0, (N_STATES,), np.float32)
     environment = SpacesEnv(observation_space, spaces.Box(-1.0, 1.0, (N_ACTIONS,), np.float32))
@@ -26,6 +29,7 @@ def make_policy(seed=0, observation_space=None, net_arch=(16, 16), activation_fn
         "world_model_net_arch": [16, 16],
         "activation_fn": activation_fn,
         "critic_normalization": critic_normalization,
+        **(more or {}),
     }
     kind = "MultiInputPolicy" if isinstance(observation_space, spaces.Dict) else "MlpPolicy"
     model = CausalGDP(kind, environment, policy_kwargs=policy_kwargs, buffer_size=10, device="cpu", **kwargs)
@@ -78,13 +82,43 @@ def states(n_rows, seed=0, device="cpu"):
 
 
 @pytest.mark.parametrize("noise_schedule", ["vp", "linear", "cosine"])
-@pytest.mark.parametrize("sampler", [{"sampler": "ddpm"}, {"sampler": "ddim"}, {"sampler": "ddim", "ddim_eta": 0.5}])
+@pytest.mark.parametrize(
+    "sampler",
+    [
+        {"sampler": "ddpm"},
+        {"sampler": "ddim"},
+        {"sampler": "ddim", "ddim_eta": 0.5},
+        {"sampler": "euler_maruyama"},
+        {"sampler": "heun"},
+        {"sampler": "dpm_solver"},
+    ],
+)
 @pytest.mark.parametrize("diffusion_steps", [1, 2, 5])
 def test_every_schedule_and_sampler(noise_schedule, sampler, diffusion_steps):
     policy = make_policy(noise_schedule=noise_schedule, diffusion_steps=diffusion_steps, **sampler)
     fast, plain = both_paths(policy, states(4))
     assert policy._acting is not None
     th.testing.assert_close(fast, plain, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("sampler", SAMPLERS)
+@pytest.mark.parametrize("sampling_steps", [1, 3, 9])
+def test_other_numbers_of_steps(sampler, sampling_steps):
+    scale = [0.5, 1.0, 2.0, 1.0, 0.5]
+    policy = make_policy(sampler=sampler, guidance_scale=scale, more={"sampling_steps": sampling_steps})
+    fast, plain = both_paths(policy, states(4))
+    assert policy._acting is not None
+    th.testing.assert_close(fast, plain, rtol=1e-5, atol=1e-5)
+    policy.guidance_ready.fill_(0.0)
+    assert not th.equal(both_paths(policy, states(4))[0], fast)
+
+
+@pytest.mark.parametrize("denoiser", ["residual_mlp", "transformer"])
+def test_other_denoisers_are_left_to_the_plain_path(denoiser):
+    policy = make_policy(more={"denoiser": denoiser})
+    fast, plain = both_paths(policy, states(4))
+    assert policy._acting is None
+    assert th.equal(fast, plain)
 
 
 @pytest.mark.parametrize("guidance", [None, "posterior", "score", "normalized"])

@@ -243,8 +243,8 @@ def test_one_step_returns_the_clean_estimate(sampler):
 
 
 def test_an_unknown_sampler_is_refused():
-    with pytest.raises(ValueError, match=r"'heun'.*ddpm.*ddim"):
-        sample(wavy, NoiseSchedule("vp", 3), th.zeros(2, 2), action_dim=2, sampler="heun")
+    with pytest.raises(ValueError, match=r"'euler'.*ddpm.*ddim.*heun"):
+        sample(wavy, NoiseSchedule("vp", 3), th.zeros(2, 2), action_dim=2, sampler="euler")
 
 
 @pytest.mark.parametrize("eta", [-0.1, 1.1, float("nan")])

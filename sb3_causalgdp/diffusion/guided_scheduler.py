@@ -1,0 +1,282 @@
+"""Guidance for a policy whose sampler is a scheduler of ``diffusers``, such as those of LeRobot and ``diffusion_policy``."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import torch as th
+
+from sb3_causalgdp.diffusion.guidance import Guidance, GuidanceRule
+
+# Share of signal below which the model's Jacobian says nothing of what the clean action is
+LEAST_SIGNAL = 1e-6
+
+
+class ActionUnits(NamedTuple):
+    """
+    From the actions of a policy's network to those of the guidance: ``action = scale * normalised + offset``.
+
+    :param scale: A number, or shape ``(d,)``
+    :param offset: A number, or shape ``(d,)``
+    """
+
+    scale: th.Tensor | float = 1.0
+    offset: th.Tensor | float = 0.0
+
+    @classmethod
+    def from_min_max(cls, low: th.Tensor, high: th.Tensor) -> "ActionUnits":
+        """
+        LeRobot's normalisation ``MIN_MAX``, to [-1, 1].
+
+        :param low: Smallest action of the dataset, shape ``(d,)``
+        :param high: The largest, shape ``(d,)``
+        :return: The way back
+        """
+        low, high = th.as_tensor(low), th.as_tensor(high)
+        return cls((high - low) / 2.0, (high + low) / 2.0)
+
+    @classmethod
+    def from_mean_std(cls, mean: th.Tensor, std: th.Tensor) -> "ActionUnits":
+        """
+        LeRobot's normalisation ``MEAN_STD``.
+
+        :param mean: Of the dataset, shape ``(d,)``
+        :param std: Of the dataset, shape ``(d,)``
+        :return: The way back
+        """
+        return cls(th.as_tensor(std), th.as_tensor(mean))
+
+    @classmethod
+    def from_linear_normalizer(cls, scale: th.Tensor, offset: th.Tensor) -> "ActionUnits":
+        """
+        ``LinearNormalizer`` of ``diffusion_policy``, ``normalizer["action"].params_dict``: ``normalised = scale * action +
+        offset``.
+
+        :param scale: Its scale, shape ``(d,)``
+        :param offset: Its offset, shape ``(d,)``
+        :return: The way back
+        """
+        scale, offset = th.as_tensor(scale), th.as_tensor(offset)
+        return cls(1.0 / scale, -offset / scale)
+
+
+class NoiseLevel(NamedTuple):
+    """
+    What a scheduler's sample is: ``signal * clean + spread * noise``.
+
+    :param signal: Factor of the clean action
+    :param spread: Standard deviation of the noise
+    """
+
+    signal: float
+    spread: float
+
+    @property
+    def norm(self) -> float:
+        """What a sample is divided by to be one of a schedule that preserves the variance."""
+        return (self.signal**2 + self.spread**2) ** 0.5
+
+    @property
+    def alpha_bar(self) -> float:
+        """Share of signal left."""
+        return (self.signal / self.norm) ** 2
+
+
+class GuidedScheduler:
+    """
+    A scheduler of ``diffusers`` whose ``step`` is steered by a guidance. All else is the scheduler's own.
+
+    For a sample ``x = signal * a + spread * eps`` the guidance adds ``G = grad_x log p(y | x)`` to the score, which moves the
+    clean estimate by ``spread^2 / signal * G``, the noise by ``-spread * G``, and the velocity ``eps - a`` of flow matching,
+    where ``signal = 1 - spread``, by ``-spread / (1 - spread) * G``. In ``step``, what the network says is turned into the
+    clean estimate, moved, and turned back, so that the scheduler's own method, clipping, history and noise stay as they are.
+
+    :param scheduler: DDPM, DDIM, DPM-Solver, Euler or flow-matching Euler, or one that is built like them
+    :param guidance: Log density over actions of shape ``(batch, d)``, in the environment's units, None for none; it may be
+        replaced before each chain, ``scheduler.guidance = ...``
+    :param rule: How the guidance enters a step, :class:`GuidanceRule` with the covariance ``unit_gaussian`` if None
+    :param model: The network, bound to its condition: ``model(sample, timestep)``, the sample scaled as the scheduler's
+        ``scale_model_input`` does it; needed by the covariances ``tweedie`` and ``isotropic``, which take its Jacobian; as
+        ``guidance``, it may be replaced before each chain
+    :param units: Units of the network's actions
+    :param position: The action of a chunk that the guidance is about, counted along the horizon; None for the whole chunk,
+        which the guidance then gets as one row of ``horizon * d`` components
+    :param clip: Bound of the network's clean actions at which the guidance is evaluated, None for no bound
+    :raises ValueError: If the rule has more scales than one
+    """
+
+    def __init__(
+        self,
+        scheduler: Any,
+        guidance: Guidance | None = None,
+        rule: GuidanceRule | None = None,
+        *,
+        model: Callable[[th.Tensor, Any], th.Tensor] | None = None,
+        units: ActionUnits | None = None,
+        position: int | None = None,
+        clip: float | None = 1.0,
+    ) -> None:
+        self.scheduler = scheduler
+        self.guidance = guidance
+        self.rule = GuidanceRule() if rule is None else rule
+        self.model = model
+        self.units = ActionUnits() if units is None else units
+        self.position = position
+        self.clip = clip
+        if len(self.rule.scales) != 1:
+            raise ValueError(f"guidance_scale must be one number here, got {len(self.rule.scales)} values")
+
+    def __getattr__(self, name: str) -> Any:
+        # Not found on this object, so the scheduler's; a copy that is not whole yet has none
+        if name == "scheduler":
+            raise AttributeError(name)
+        return getattr(self.scheduler, name)
+
+    def __len__(self) -> int:
+        return len(self.scheduler)
+
+    def step(self, model_output: th.Tensor, timestep: Any, sample: th.Tensor, *args: Any, **kwargs: Any) -> Any:
+        """
+        The scheduler's step, guided.
+
+        :param model_output: What the network predicts, shape ``(batch, d)`` or ``(batch, horizon, d)``
+        :param timestep: The scheduler's timestep
+        :param sample: The noisy actions, as the scheduler has them, of the same shape
+        :param args: Further arguments of the scheduler
+        :param kwargs: Further arguments of the scheduler
+        :return: What the scheduler returns
+        """
+        if self.guidance is not None:
+            level = self.noise_level(timestep)
+            clean = self.clean_estimate(model_output, sample, level) + self.shift(model_output, timestep, sample, level)
+            model_output = self._prediction(clean, sample, level).to(model_output.dtype)
+        return self.scheduler.step(model_output, timestep, sample, *args, **kwargs)
+
+    def noise_level(self, timestep: Any) -> NoiseLevel:
+        """
+        :param timestep: The scheduler's timestep
+        :return: What its sample is made of there
+        """
+        scheduler = self.scheduler
+        sigmas = getattr(scheduler, "sigmas", None)
+        if sigmas is None:
+            alpha_bar = float(scheduler.alphas_cumprod[int(timestep)])
+            return NoiseLevel(alpha_bar**0.5, (1.0 - alpha_bar) ** 0.5)
+        if scheduler.step_index is None:
+            scheduler._init_step_index(timestep)
+        sigma = float(sigmas[scheduler.step_index])
+        if self.is_flow:
+            return NoiseLevel(1.0 - sigma, sigma)
+        if hasattr(scheduler, "_sigma_to_alpha_sigma_t"):
+            signal = (1.0 + sigma**2) ** -0.5
+            return NoiseLevel(signal, sigma * signal)
+        return NoiseLevel(1.0, sigma)
+
+    @property
+    def is_flow(self) -> bool:
+        """Whether the scheduler's noise goes to the action along a straight line, as in flow matching."""
+        config = self.scheduler.config
+        return not hasattr(self.scheduler, "alphas_cumprod") or bool(config.get("use_flow_sigmas", False))
+
+    @property
+    def prediction_type(self) -> str:
+        """What the network predicts: ``epsilon``, ``sample``, ``v_prediction`` or ``flow_prediction``."""
+        return self.scheduler.config.get("prediction_type", "flow_prediction")
+
+    def clean_estimate(self, model_output: th.Tensor, sample: th.Tensor, level: NoiseLevel) -> th.Tensor:
+        """
+        :param model_output: What the network predicts
+        :param sample: The noisy actions
+        :param level: What they are made of
+        :return: Its estimate of the clean actions, of the same shape
+        :raises ValueError: If the scheduler has another prediction type
+        """
+        signal, spread = level
+        if self.prediction_type == "epsilon":
+            return (sample - spread * model_output) / signal
+        if self.prediction_type == "sample":
+            return model_output
+        if self.prediction_type == "v_prediction":
+            return (signal * sample / level.norm - spread * model_output) / level.norm
+        if self.prediction_type == "flow_prediction":
+            return sample - spread * model_output
+        raise ValueError(
+            "prediction_type must be 'epsilon', 'sample', 'v_prediction' or 'flow_prediction', "
+            f"got {self.prediction_type!r} of {type(self.scheduler).__name__}"
+        )
+
+    def _prediction(self, clean: th.Tensor, sample: th.Tensor, level: NoiseLevel) -> th.Tensor:
+        """The inverse of :meth:`clean_estimate`."""
+        signal, spread = level
+        if self.prediction_type == "epsilon":
+            return (sample - signal * clean) / spread
+        if self.prediction_type == "sample":
+            return clean
+        if self.prediction_type == "v_prediction":
+            return (signal * sample / level.norm - level.norm * clean) / spread
+        return (sample - clean) / spread
+
+    @th.no_grad()
+    def shift(self, model_output: th.Tensor, timestep: Any, sample: th.Tensor, level: NoiseLevel) -> th.Tensor:
+        """
+        How far the guidance moves the clean estimate.
+
+        :param model_output: What the network predicts
+        :param timestep: The scheduler's timestep
+        :param sample: The noisy actions
+        :param level: What they are made of
+        :return: The shift in the network's units, of the sample's shape
+        """
+        assert self.guidance is not None
+        shape = sample.shape
+        clean = self.clean_estimate(model_output, sample, level)
+        gradient, curvature = self._local_model(clean if self.clip is None else clean.clamp(-self.clip, self.clip))
+        # At no signal at all a network says what it likes, and what it says does not depend on the sample
+        has_jacobian = self.rule.needs_jacobian and level.alpha_bar > LEAST_SIGNAL
+        share = th.full((1, 1), max(level.alpha_bar, 1e-12), dtype=gradient.dtype, device=gradient.device)
+        rule = self.rule if has_jacobian or not self.rule.needs_jacobian else GuidanceRule("posterior", "unit_gaussian")
+        jacobian = level.norm * self._jacobian(timestep, sample, level) if has_jacobian else None
+        direction = rule(gradient, curvature, share, jacobian)
+        return (self.rule.scales[0] * (1.0 - share) / share.sqrt() * direction).reshape(shape)
+
+    def _local_model(self, clean: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """Gradient and curvature of the guidance in the network's units, of shapes ``(batch, m)`` and ``(batch, m, m)``."""
+        assert self.guidance is not None
+        scale, offset = (th.as_tensor(value, dtype=clean.dtype, device=clean.device) for value in self.units)
+        factor = scale.expand(clean.shape[1:])
+        actions = scale * clean + offset
+        if clean.ndim == 2 or self.position is None:
+            gradient, curvature = self.guidance(actions.flatten(1))
+            factor = factor.flatten()
+            return gradient * factor, curvature * factor[:, None] * factor
+        gradient, curvature = self.guidance(actions[:, self.position])
+        factor = factor[self.position]
+        whole_gradient = th.zeros_like(clean)
+        whole_gradient[:, self.position] = gradient * factor
+        batch, horizon, width = clean.shape
+        whole_curvature = clean.new_zeros(batch, horizon, width, horizon, width)
+        whole_curvature[:, self.position, :, self.position] = curvature * factor[:, None] * factor
+        return whole_gradient.flatten(1), whole_curvature.reshape(batch, horizon * width, horizon * width)
+
+    def _jacobian(self, timestep: Any, sample: th.Tensor, level: NoiseLevel) -> th.Tensor:
+        """Of the clean estimate by the sample, shape ``(batch, m, m)``."""
+        model, shape = self.model, sample.shape
+        if model is None:
+            raise ValueError(
+                f"guidance_covariance={self.rule.covariance!r} needs the network's Jacobian: give model, or 'unit_gaussian'"
+            )
+        n_components = sample[0].numel()
+
+        def scaled(noisy: th.Tensor) -> th.Tensor:
+            # Flow matching has no scaling, and no method of that name
+            scale = getattr(self.scheduler, "scale_model_input", None)
+            return noisy if scale is None else scale(noisy, timestep)
+
+        def clean(noisy: th.Tensor) -> th.Tensor:
+            return self.clean_estimate(model(scaled(noisy), timestep), noisy, level).flatten(1)
+
+        def column(tangent: th.Tensor) -> th.Tensor:
+            tangents = tangent.reshape(shape[1:]).expand(shape)
+            return th.func.jvp(clean, (sample,), (tangents,))[1]
+
+        identity = th.eye(n_components, dtype=sample.dtype, device=sample.device)
+        return th.func.vmap(column)(identity).permute(1, 2, 0)
