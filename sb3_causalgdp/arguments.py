@@ -324,6 +324,7 @@ CONSTRUCTOR_ARGUMENTS: dict[str, Kind] = {
     "max_q_backup": FLAG,
     "max_grad_norm": number(0.0, LARGEST_NUMBER, above=True) | NONE,
     **SHARED_ARGUMENTS,
+    "exploration_noise": schedule(number(0.0, LARGEST_NOISE)),
     "causal_discovery": choice(DISCOVERY_METHODS) | FUNCTION,
     "causal_discovery_kwargs": KEYWORDS | NONE,
     "causal_refresh_freq": STEPS,

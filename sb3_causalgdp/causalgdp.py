@@ -97,7 +97,8 @@ class CausalGDP(AskedAlgorithm, SavedAlgorithm):
     :param sampler: ``ddpm``, ``ddim``, ``euler_maruyama``, ``heun`` or ``dpm_solver``
     :param ddim_eta: Noise of DDIM, from 0 (deterministic) to 1 (DDPM)
     :param n_action_candidates: Number of sampled actions of which a prediction takes the best by the smallest target Q
-    :param exploration_noise: Standard deviation of the Gaussian noise of non-deterministic predictions, for actions in [-1, 1]
+    :param exploration_noise: Standard deviation of the Gaussian noise of non-deterministic predictions, for actions in [-1, 1];
+        a number or a function of the current progress remaining (from 1 to 0)
     :param guidance: ``posterior`` (the gradient of log p(y | a^k), with the uncertainty of the clean action in it), ``score``
         (the paper's plain gradient), ``normalized`` (unit length), or None
     :param guidance_target: What is wished for: ``return`` (one standard deviation of Q more than predicted) or ``reward`` (r*,
@@ -201,7 +202,7 @@ class CausalGDP(AskedAlgorithm, SavedAlgorithm):
         sampler: str = "ddpm",
         ddim_eta: float = 0.0,
         n_action_candidates: int = 10,
-        exploration_noise: float = 0.2,
+        exploration_noise: float | Schedule = 0.2,
         guidance: str | None = "posterior",
         guidance_target: str = "return",
         guidance_covariance: str = "unit_gaussian",
@@ -368,10 +369,11 @@ class CausalGDP(AskedAlgorithm, SavedAlgorithm):
 
     def _own_policy_kwargs(self) -> dict[str, Any]:
         names = (
-            "diffusion_steps noise_schedule sampler ddim_eta n_action_candidates exploration_noise guidance guidance_target "
+            "diffusion_steps noise_schedule sampler ddim_eta n_action_candidates guidance guidance_target "
             "guidance_covariance guidance_scale state_guidance_scale outcome_guidance_scale"
         ).split()
-        return {**{name: getattr(self, name) for name in names}, "discount": self.gamma}
+        own = {name: getattr(self, name) for name in names}
+        return {**own, "exploration_noise": FloatSchedule(self.exploration_noise)(1.0), "discount": self.gamma}
 
     def _create_aliases(self) -> None:
         self.actor = self.policy.actor
@@ -390,6 +392,8 @@ class CausalGDP(AskedAlgorithm, SavedAlgorithm):
     def _update_learning_rates(self) -> None:
         self._update_learning_rate(self.actor.optimizer)
         progress = self._current_progress_remaining
+        if callable(self.exploration_noise):
+            self.policy.exploration_noise = self.exploration_noise(progress)
         critic_lr_schedule = self.critic_lr_schedule or self.lr_schedule
         update_learning_rate(self.critic.optimizer, critic_lr_schedule(progress))
         update_learning_rate(optimizer_of(self.world_model), self.world_model_lr_schedule(progress))

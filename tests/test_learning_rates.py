@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch as th
 from small_models import SMALL
+from stable_baselines3.common.utils import LinearSchedule
 
 from sb3_causalgdp import CausalGDP, CausalWorldModelCallback
 
@@ -117,3 +118,18 @@ def test_rates_and_schedules_survive_saving_and_new_ones_take_effect():
 def test_rates_that_make_no_sense_are_refused_at_once(name, rate):
     with pytest.raises(ValueError, match=f"^{name} must be a number from 0 to "):
         make(**{name: rate})
+
+
+def test_exploration_noise_follows_its_schedule(tmp_path):
+    model = make(exploration_noise=LinearSchedule(0.4, 0.1, 1.0))
+    assert model.policy.exploration_noise == pytest.approx(0.4)
+    model.learn(80)
+    assert model.policy.exploration_noise == pytest.approx(0.1, abs=0.04)
+    model.save(tmp_path / "model.zip")
+    assert CausalGDP.load(tmp_path / "model.zip").exploration_noise(1.0) == pytest.approx(0.4)
+
+
+def test_a_number_for_the_exploration_noise_leaves_the_policy_s_own_alone():
+    model = make(exploration_noise=0.3)
+    model.policy.exploration_noise = 0.05
+    assert model.learn(80).policy.exploration_noise == 0.05

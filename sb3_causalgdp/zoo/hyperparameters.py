@@ -39,7 +39,7 @@ COMMAND_LINE_KEYS = {
     "verbose": "--verbose",
 }
 # Arguments that may be "lin_" and a number: from there to 0 over the training
-SCHEDULES = ("learning_rate", "critic_learning_rate", "world_model_learning_rate", "offline_fraction")
+SCHEDULES = ("learning_rate", "critic_learning_rate", "world_model_learning_rate", "offline_fraction", "exploration_noise")
 # YAML 1.1 asks for a dot and a sign, and reads 3e-4 as text
 SCIENTIFIC = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+")
 
