@@ -97,8 +97,8 @@ class CausalGDP(AskedAlgorithm, SavedAlgorithm):
     :param sampler: ``ddpm``, ``ddim``, ``euler_maruyama``, ``heun`` or ``dpm_solver``
     :param ddim_eta: Noise of DDIM, from 0 (deterministic) to 1 (DDPM)
     :param n_action_candidates: Number of sampled actions of which a prediction takes the best by the smallest target Q
-    :param exploration_noise: Standard deviation of the Gaussian noise of non-deterministic predictions, for actions in [-1, 1];
-        a number or a function of the current progress remaining (from 1 to 0)
+    :param exploration_noise: Standard deviation of the Gaussian noise of non-deterministic predictions, for actions in
+        [-1, 1]; a number or a function of the current progress remaining (from 1 to 0)
     :param guidance: ``posterior`` (the gradient of log p(y | a^k), with the uncertainty of the clean action in it), ``score``
         (the paper's plain gradient), ``normalized`` (unit length), or None
     :param guidance_target: What is wished for: ``return`` (one standard deviation of Q more than predicted) or ``reward`` (r*,
