@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from sb3_causalgdp.checkpoints import TrainingCheckpointCallback
     from sb3_causalgdp.divergence import TrainingDivergedError
     from sb3_causalgdp.policies import CnnPolicy, MlpPolicy, MultiInputPolicy
+    from sb3_causalgdp.presets import preset
 
 __version__ = Path(__file__).with_name("version.txt").read_text(encoding="utf-8").strip()
 
@@ -26,6 +27,7 @@ __getattr__, __dir__ = lazy_names(
         "MultiInputPolicy": "sb3_causalgdp.policies",
         "TrainingCheckpointCallback": "sb3_causalgdp.checkpoints",
         "TrainingDivergedError": "sb3_causalgdp.divergence",
+        "preset": "sb3_causalgdp.presets",
     },
 )
 
@@ -38,4 +40,5 @@ __all__ = [
     "TrainingCheckpointCallback",
     "TrainingDivergedError",
     "__version__",
+    "preset",
 ]

@@ -26,7 +26,7 @@ from sb3_causalgdp.diffusion.plans import SAMPLERS
 from sb3_causalgdp.diffusion.schedules import NOISE_SCHEDULES
 from sb3_causalgdp.offline.rewards import REWARD_TRANSFORMS
 
-ACTOR_UPDATES = ("one_step", "chain")
+ACTOR_UPDATES = ("one_step", "chain", "weighted", "imitation", "trust_region")
 CRITIC_NORMALIZATIONS = ("batch", "layer")
 PREDICTION_TYPES = ("noise", "velocity")
 Q_SCALES = ("value", "advantage")
@@ -316,6 +316,9 @@ CONSTRUCTOR_ARGUMENTS: dict[str, Kind] = {
     "denoising_weight": WEIGHT,
     "actor_update": choice(ACTOR_UPDATES),
     "q_scale": choice(Q_SCALES),
+    "expectile": number(0.0, 1.0, above=True) | NONE,
+    "advantage_temperature": WEIGHT,
+    "improvement_step": number(0.0, 2.0, above=True),
     "bound_penalty": WEIGHT,
     "policy_delay": STEPS,
     "world_model_delay": STEPS,
@@ -350,6 +353,14 @@ CONSTRUCTOR_ARGUMENTS: dict[str, Kind] = {
 }
 """Every argument of :class:`~sb3_causalgdp.CausalGDP`."""
 
+DISTILLATION_ARGUMENTS: dict[str, Kind] = {
+    "n_observations": STEPS,
+    "gradient_steps": STEPS,
+    "batch_size": integer(1, MOST_GRADIENT_STEPS),
+    "learning_rate": number(0.0, LARGEST_WEIGHT, above=True),
+}
+"""Every argument of :meth:`~sb3_causalgdp.CausalGDP.distil`."""
+
 POLICY_ARGUMENTS: dict[str, Kind] = {
     "observation_space": instance(spaces.Space, "a space of Gymnasium"),
     "action_space": instance(spaces.Box, "a Box of Gymnasium"),
@@ -378,6 +389,8 @@ POLICY_ARGUMENTS: dict[str, Kind] = {
     "denoiser": choice(DENOISERS) | subclass(nn.Module, "a class of torch.nn"),
     "denoiser_kwargs": KEYWORDS | NONE,
     "discount": SHARE,
+    "one_pass": FLAG,
+    "value_network": FLAG,
 }
 """Every argument of :class:`~sb3_causalgdp.policies.CausalGDPPolicy`, what goes into ``policy_kwargs`` among them."""
 

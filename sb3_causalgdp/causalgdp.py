@@ -19,6 +19,7 @@ from stable_baselines3.common.utils import FloatSchedule, update_learning_rate
 from sb3_causalgdp.acceleration.gradients import check_compile
 from sb3_causalgdp.arguments import (
     CONSTRUCTOR_ARGUMENTS,
+    DISTILLATION_ARGUMENTS,
     POLICY_ARGUMENTS,
     check_action_space,
     check_arguments,
@@ -31,6 +32,7 @@ from sb3_causalgdp.causal.world_model import MaskedWorldModel
 from sb3_causalgdp.checkpoints import TrainingCheckpointCallback, begin_training
 from sb3_causalgdp.checkpoints.checkpoint import all_callbacks, end_last_episodes, fresh_seed
 from sb3_causalgdp.checks import check_from_environment, is_finite
+from sb3_causalgdp.distillation import distil
 from sb3_causalgdp.divergence import TrainingDivergedError, check_losses
 from sb3_causalgdp.offline.algorithm import callback_list
 from sb3_causalgdp.offline.preload import normalised_parts
@@ -80,9 +82,17 @@ class CausalGDP(AskedAlgorithm, SavedAlgorithm):
         where it pulls towards the actions of older policies, it has to be small
     :param actor_update: Which action the Q term of the policy loss judges. ``one_step``: the clean action that the noise
         prediction of the denoising term gives already (EDP, https://arxiv.org/abs/2305.20081), half the cost of an update;
-        ``chain``: the end of the whole chain, through which the gradient then flows (Diffusion-QL)
+        ``chain``: the end of the whole chain, through which the gradient then flows (Diffusion-QL). Without a Q term:
+        ``weighted`` regresses onto the batch's actions, weighted by their advantage (IQL); ``imitation`` onto the actor's own,
+        a step further up Q (QVPO). ``trust_region``: a network that acts in one pass climbs Q where the denoiser, which models
+        the data alone, finds its actions likely (DTQL)
     :param q_scale: What the Q term is divided by. ``value``: by the mean absolute Q (Diffusion-QL), which grows with the
         returns; ``advantage``: by how much the Q of the policy's actions differs from that of the replayed ones, in the mean
+    :param expectile: If given, a network V(s) learns this expectile of Q of the actions in the data, and TD targets are made
+        with it (IQL, https://arxiv.org/abs/2110.06169): Q is asked of no other action. ``actor_update="weighted"`` needs it
+    :param advantage_temperature: Of ``actor_update="weighted"``: how much more an action counts for its advantage, in units of
+        the batch's mean absolute advantage
+    :param improvement_step: Of ``actor_update="imitation"``: how far up Q an action is moved, in each component of [-1, 1]
     :param bound_penalty: Weight, in the policy loss, of the mean squared distance of clean actions from [-1, 1] before they
         are clipped, so that none goes so far that it finds no way back
     :param policy_delay: The actor is updated once every so many gradient steps, as in TD3. Where a call of :meth:`train` makes
@@ -190,6 +200,9 @@ class CausalGDP(AskedAlgorithm, SavedAlgorithm):
         denoising_weight: float = 0.01,
         actor_update: str = "one_step",
         q_scale: str = "value",
+        expectile: float | None = None,
+        advantage_temperature: float = 3.0,
+        improvement_step: float = 0.1,
         bound_penalty: float = 0.1,
         policy_delay: int = 3,
         world_model_delay: int = 2,
@@ -275,6 +288,9 @@ class CausalGDP(AskedAlgorithm, SavedAlgorithm):
         self.denoising_weight = denoising_weight
         self.actor_update = actor_update
         self.q_scale = q_scale
+        self.expectile = expectile
+        self.advantage_temperature = advantage_temperature
+        self.improvement_step = improvement_step
         self.bound_penalty = bound_penalty
         self.policy_delay = policy_delay
         self.world_model_delay = world_model_delay
@@ -334,6 +350,10 @@ class CausalGDP(AskedAlgorithm, SavedAlgorithm):
             raise ValueError(
                 "max_q_backup must be False without target critics, got True: critic_normalization='layer' has them"
             )
+        if self.expectile is not None and self.policy.critic.normalizes_batches:
+            raise ValueError(
+                f"expectile must be None without target critics, got {self.expectile}: critic_normalization='layer' has them"
+            )
         self._create_aliases()
         self._setup_discovery()
 
@@ -353,6 +373,8 @@ class CausalGDP(AskedAlgorithm, SavedAlgorithm):
 
     def _check_together(self) -> None:
         """Arguments that are right alone, and not with the others."""
+        if self.actor_update == "weighted" and self.expectile is None:
+            raise ValueError("expectile must be a number with actor_update='weighted', got None")
         n_positions = self.buffer_size // self.n_envs
         if counts_episodes(self.train_freq) and self.n_envs > 1:
             raise ValueError(f"train_freq must be in steps with {self.n_envs} environments, got {self.train_freq!r}")
@@ -373,7 +395,9 @@ class CausalGDP(AskedAlgorithm, SavedAlgorithm):
             "guidance_covariance guidance_scale state_guidance_scale outcome_guidance_scale"
         ).split()
         own = {name: getattr(self, name) for name in names}
-        return {**own, "exploration_noise": FloatSchedule(self.exploration_noise)(1.0), "discount": self.gamma}
+        own["exploration_noise"] = FloatSchedule(self.exploration_noise)(1.0)
+        networks = {"one_pass": self.actor_update == "trust_region", "value_network": self.expectile is not None}
+        return {**own, "discount": self.gamma, **{name: True for name, is_asked in networks.items() if is_asked}}
 
     def _create_aliases(self) -> None:
         self.actor = self.policy.actor
@@ -491,6 +515,36 @@ class CausalGDP(AskedAlgorithm, SavedAlgorithm):
             reset_num_timesteps=reset_num_timesteps,
             progress_bar=progress_bar,
         )
+
+    def distil(
+        self, n_observations: int = 20_000, gradient_steps: int = 20_000, batch_size: int = 256, learning_rate: float = 1e-3
+    ) -> CausalGDPPolicy:
+        """
+        Make a policy that acts in one pass, for robots that must act at once: a perceptron that does what this model's
+        policy does without noise, guidance included, on the observations of the replay buffer and the preloaded transitions.
+
+        :param n_observations: Number of observations that the policy is asked for, drawn as batches are
+        :param gradient_steps: How many the perceptron is trained for
+        :param batch_size: Observations for each
+        :param learning_rate: Of its optimizer, falling to 0
+        :return: The policy, with ``predict`` and ``save``; this model goes on as before
+        :raises ValueError: If an argument is out of range, there are no transitions, or the policy acts in one pass already
+        """
+        check_arguments(DISTILLATION_ARGUMENTS, locals())
+        if self.actor.one_pass is not None:
+            raise ValueError("distil() needs a policy that denoises, got one that acts in one pass")
+        buffers = [buffer for buffer in (self.replay_buffer, self.offline_buffer) if buffer is not None]
+        if sum(buffer.size() for buffer in buffers) == 0:
+            raise ValueError(
+                "distil() needs transitions, got an empty replay buffer: learn(), preload() or load_replay_buffer()"
+            )
+        numpy_state, rows = np.random.get_state(), 500
+        with th.random.fork_rng():
+            counts = [min(rows, n_observations - first) for first in range(0, n_observations, rows)]
+            observations = [self._updates.batches.sample(count).observations for count in counts]
+            student = distil(self.policy, observations, gradient_steps, batch_size, learning_rate)
+        np.random.set_state(numpy_state)
+        return student
 
     def _setup_learn(
         self,

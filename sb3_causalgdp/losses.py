@@ -26,11 +26,13 @@ class DenoisingTerms(NamedTuple):
     :param clean_actions: Clipped to [-1, 1] with a gradient that leads back inside, shape ``(batch, d)``: one step stands for
         the whole chain in the policy improvement of EDP (Kang et al., 2023, equation 9)
     :param outside: Mean squared distance of the clean actions from their bounds before they are clipped
+    :param trust_region: What :func:`trust_region_loss` says of another network's actions, None where there is none
     """
 
     loss: th.Tensor
     clean_actions: th.Tensor
     outside: th.Tensor
+    trust_region: th.Tensor | None = None
 
 
 def td_target(
@@ -73,6 +75,7 @@ def denoising_loss(
     guidance: Guidance | None = None,
     rule: GuidanceRule | None = None,
     continuous: bool = False,
+    weights: th.Tensor | None = None,
 ) -> DenoisingTerms:
     """
     ``E || eps_theta(a^k, k, s) - eps_cg ||^2``: the noise really injected, shifted by the guidance (stop-gradient).
@@ -85,20 +88,102 @@ def denoising_loss(
     :param rule: How the guidance enters, needed with a guidance
     :param continuous: Whether times are drawn from all between the first and the last diffusion step, for samplers that take
         other steps than the schedule's (denoising score matching in continuous time, Song et al., 2021, equation 7)
+    :param weights: Of the actions in the loss, like those of :func:`advantage_weights`, shape ``(batch, 1)``; None for equal
+        ones
     :return: The loss, and what the same noise prediction says of the clean actions
     """
-    if continuous:
-        step = th.rand(len(actions), device=actions.device) * (schedule.n_steps - 1)
-    else:
-        step = th.randint(schedule.n_steps, (len(actions),), device=actions.device)
-    noise = th.randn_like(actions)
-    noisy = schedule.add_noise(actions, noise, step)
+    noisy, noise, step = _noised(schedule, actions, continuous)
     predict_noise = bind(denoiser, features)
     predicted = predict_noise(noisy, step)
     clean_action = schedule.clean_estimate(noisy, predicted, step)
     if guidance is not None and rule is not None:
         noise = noise - guidance_shift(guidance, rule, predict_noise, schedule, noisy, predicted.detach(), step)
-    return DenoisingTerms(F.mse_loss(predicted, noise), bounded(clean_action), outside(clean_action))
+    loss = F.mse_loss(predicted, noise) if weights is None else (weights * (predicted - noise).square()).mean()
+    return DenoisingTerms(loss, bounded(clean_action), outside(clean_action))
+
+
+def _noised(schedule: NoiseSchedule, actions: th.Tensor, continuous: bool) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
+    """Noisy actions, their noise and their diffusion steps, drawn anew."""
+    if continuous:
+        step = th.rand(len(actions), device=actions.device) * (schedule.n_steps - 1)
+    else:
+        step = th.randint(schedule.n_steps, (len(actions),), device=actions.device)
+    noise = th.randn_like(actions)
+    return schedule.add_noise(actions, noise, step), noise, step
+
+
+def trust_region_loss(
+    denoiser: th.nn.Module, schedule: NoiseSchedule, features: th.Tensor, actions: th.Tensor, continuous: bool = False
+) -> th.Tensor:
+    """
+    The denoising loss of a behaviour model at another policy's actions, which is small where the behaviour is dense (diffusion
+    trusted Q-learning, Chen et al., 2024, https://arxiv.org/abs/2405.19690, equation 7). The model itself does not follow.
+
+    :param denoiser: Of the behaviour model
+    :param schedule: Noise schedule
+    :param features: What the denoiser is conditioned on, shape ``(batch, features_dim)``; no gradient flows into it
+    :param actions: The other policy's, with a gradient, shape ``(batch, d)``
+    :param continuous: As in :func:`denoising_loss`
+    :return: Scalar
+    """
+    noisy, noise, step = _noised(schedule, actions, continuous)
+    fixed = {name: parameter.detach() for name, parameter in denoiser.named_parameters()}
+    return F.mse_loss(th.func.functional_call(denoiser, fixed, (noisy, step, features.detach())), noise)
+
+
+def expectile_loss(values: th.Tensor, targets: th.Tensor, expectile: float) -> th.Tensor:
+    """
+    ``E[|expectile - 1(Q < V)| (Q - V)^2]`` (IQL, Kostrikov et al., 2022, https://arxiv.org/abs/2110.06169, equation 5).
+
+    :param values: V(s), shape ``(batch, 1)``
+    :param targets: Q(s, a) of the batch's actions, shape ``(batch, 1)``
+    :param expectile: 0.5 gives their mean, 1 their maximum
+    :return: Scalar
+    """
+    difference = targets - values
+    weight = th.where(difference > 0.0, expectile, 1.0 - expectile)
+    return (weight * difference.square()).mean()
+
+
+def advantage_weights(advantages: th.Tensor, temperature: float, largest: float = 100.0) -> th.Tensor:
+    """
+    ``exp(temperature A / E|A|)``, at most ``largest``, over their mean (advantage-weighted regression, as in IQL, equation 7).
+    The papers' advantages are of normalised rewards; these are in units of their own size.
+
+    :param advantages: Q(s, a) - V(s), shape ``(batch, 1)``
+    :param temperature: 0 weighs all actions alike
+    :param largest: Bound of the weights
+    :return: Shape ``(batch, 1)``, 1 in the mean
+    """
+    size = advantages.abs().mean().clamp(min=SMALLEST_SCALE)
+    weights = (temperature * advantages / size).exp().clamp(max=largest)
+    return weights / weights.mean()
+
+
+def improved_actions(actions: th.Tensor, gradient: th.Tensor, step: float) -> th.Tensor:
+    """
+    Actions a step further along the gradient of Q (critic-guided self-imitation).
+
+    :param actions: In [-1, 1], shape ``(batch, d)``
+    :param gradient: Of Q by them, shape ``(batch, d)``
+    :param step: Its length for each component, in the root of their mean square
+    :return: In [-1, 1], shape ``(batch, d)``
+    """
+    direction = gradient / gradient.norm(dim=1, keepdim=True).clamp(min=SMALLEST_SCALE)
+    return (actions + step * actions.shape[1] ** 0.5 * direction).clamp(-1.0, 1.0)
+
+
+def improvement_weights(before: th.Tensor, after: th.Tensor) -> th.Tensor:
+    """
+    ``relu(Q(s, a*) - Q(s, a))`` over its mean: what did not become better is not imitated (QVPO, Ding et al., 2024,
+    https://arxiv.org/abs/2405.16173, equation 11, with the actor's own action as the baseline).
+
+    :param before: Q at the actor's actions, shape ``(batch, 1)``
+    :param after: Q at the improved ones, shape ``(batch, 1)``
+    :return: Shape ``(batch, 1)``
+    """
+    risen = th.relu(after - before)
+    return risen / risen.mean().clamp(min=SMALLEST_SCALE)
 
 
 def q_loss(values: th.Tensor, others: th.Tensor, of_data: th.Tensor | None = None) -> th.Tensor:

@@ -13,6 +13,7 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, create_
 from stable_baselines3.common.type_aliases import PyTorchObs
 from torch import nn
 
+from sb3_causalgdp.acceleration.activations import fast
 from sb3_causalgdp.acceleration.products import make_layers_fast
 from sb3_causalgdp.diffusion import Guidance, GuidanceRule, NoiseSchedule, make_denoiser, sample
 from sb3_causalgdp.diffusion.samplers import bind, check_sampler
@@ -67,13 +68,14 @@ class Critic(PickledAlone, ContinuousCritic):
 
     :param normalization: ``layer`` normalises hidden layers before their activation, ``batch`` the inputs of each layer over
         the batch, as in CrossQ; None for none
+    :param value_network: Whether there is a network V(s) beside them
     :param kwargs: Keyword arguments of SB3's critics
     """
 
     BATCH_NORM_MOMENTUM = 0.01
     BATCH_NORM_EPSILON = 1e-3
 
-    def __init__(self, normalization: str | None = None, **kwargs: Any) -> None:
+    def __init__(self, normalization: str | None = None, value_network: bool = False, **kwargs: Any) -> None:
         super().__init__(**kwargs)
         n_inputs = kwargs["features_dim"] + get_action_dim(kwargs["action_space"])
         norms: dict[str, list[Any]] = {}
@@ -89,6 +91,11 @@ class Critic(PickledAlone, ContinuousCritic):
                 self.q_networks[index] = network = nn.Sequential(*layers)
                 setattr(self, f"qf{index}", network)
             make_layers_fast(network)
+        self.value_network = None
+        if value_network:
+            layers = create_mlp(kwargs["features_dim"], 1, kwargs["net_arch"], kwargs["activation_fn"], **norms)
+            self.value_network = nn.Sequential(*layers)
+            make_layers_fast(self.value_network)
         modules = (module for network in self.q_networks for module in network.modules())
         self._batch_norms = tuple(module for module in modules if isinstance(module, nn.BatchNorm1d))
 
@@ -111,6 +118,23 @@ class Critic(PickledAlone, ContinuousCritic):
         yield
         for module in self._batch_norms:
             module.training = False
+
+    def value(self, observations: PyTorchObs) -> th.Tensor:
+        """
+        :param observations: Of the batch
+        :return: V(s) of the value network, shape ``(batch, 1)``
+        """
+        assert self.value_network is not None
+        return self.value_network(self.extract_features(observations, self.features_extractor))
+
+    def smallest(self, observations: PyTorchObs, actions: th.Tensor) -> th.Tensor:
+        """
+        :param observations: Of the batch
+        :param actions: Shape ``(batch, d)``
+        :return: The smallest Q, shape ``(batch, 1)``
+        """
+        features = self.extract_features(observations, self.features_extractor)
+        return th.cat(q_values(self, features, actions), dim=1).amin(dim=1, keepdim=True)
 
     def forward_both(
         self, observations: PyTorchObs, actions: th.Tensor, next_observations: PyTorchObs, next_actions: th.Tensor
@@ -153,6 +177,7 @@ class DiffusionActor(PickledAlone, BasePolicy):
     :param sampling_steps: Number of the sampler's steps, None for K
     :param denoiser: Name or class of the denoiser, see :func:`~sb3_causalgdp.diffusion.make_denoiser`
     :param denoiser_kwargs: Further arguments of the denoiser
+    :param one_pass: Whether the actions are those of a perceptron, which asks the denoiser nothing: it is trained beside it
     """
 
     # Noise's share of the variance from which an action is adapted to a state near by
@@ -175,6 +200,7 @@ class DiffusionActor(PickledAlone, BasePolicy):
         sampling_steps: int | None = None,
         denoiser: str | type[nn.Module] = "mlp",
         denoiser_kwargs: dict[str, Any] | None = None,
+        one_pass: bool = False,
     ) -> None:
         super().__init__(
             observation_space,
@@ -204,6 +230,11 @@ class DiffusionActor(PickledAlone, BasePolicy):
         self.denoiser = make_denoiser(
             denoiser, self.action_dim, features_dim, diffusion_steps, net_arch, activation_fn, denoiser_kwargs, alpha_bar
         )
+        self.one_pass = None
+        if one_pass:
+            layers = create_mlp(features_dim, self.action_dim, net_arch, fast(activation_fn), squash_output=True)
+            self.one_pass = nn.Sequential(*layers)
+            make_layers_fast(self.one_pass)
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         data = super()._get_constructor_parameters()
@@ -220,6 +251,7 @@ class DiffusionActor(PickledAlone, BasePolicy):
             sampling_steps=self.sampling_steps,
             denoiser=self.denoiser_class,
             denoiser_kwargs=self.denoiser_kwargs,
+            one_pass=self.one_pass is not None,
         )
         return data
 
@@ -239,7 +271,7 @@ class DiffusionActor(PickledAlone, BasePolicy):
         divergences: list[th.Tensor] | None = None,
     ) -> th.Tensor:
         """
-        Denoise actions, see :func:`sb3_causalgdp.diffusion.sample`.
+        Denoise actions, see :func:`sb3_causalgdp.diffusion.sample`; or, with a one-pass network, ask this alone.
 
         :param features: Shape ``(batch, features_dim)``
         :param noise: Shape ``(sampling_steps, batch, d)``, drawn if None
@@ -248,6 +280,8 @@ class DiffusionActor(PickledAlone, BasePolicy):
         :param divergences: If a list, each guided step appends its KL divergence
         :return: Actions in [-1, 1], shape ``(batch, d)``
         """
+        if self.one_pass is not None:
+            return self.one_pass(features)
         return sample(
             self.denoiser,
             self.schedule,

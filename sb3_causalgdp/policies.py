@@ -17,7 +17,7 @@ from stable_baselines3.common.torch_layers import (
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
-from sb3_causalgdp.acceleration.acting import NumpyActing
+from sb3_causalgdp.acceleration.acting import NumpyActing, OnePassActing
 from sb3_causalgdp.acceleration.activations import fast
 from sb3_causalgdp.arguments import POLICY_ARGUMENTS, check_arguments, check_keywords
 from sb3_causalgdp.causal import CausalGuidance, LinearisedGuidance, MaskedWorldModel, ReturnTarget, RewardTarget
@@ -79,6 +79,9 @@ class CausalGDPPolicy(SavedPolicy):
     :param n_action_candidates: Number of candidates N of which prediction plays the best
     :param exploration_noise: Standard deviation of the Gaussian noise of stochastic predictions, actions being in [-1, 1]
     :param discount: Discount factor, for the return target
+    :param one_pass: Whether a perceptron acts, trained beside the denoiser: one pass, no candidates and no steering while
+        acting
+    :param value_network: Whether the critics have a network V(s) beside them
     """
 
     actor: DiffusionActor
@@ -125,6 +128,8 @@ class CausalGDPPolicy(SavedPolicy):
         n_action_candidates: int = 10,
         exploration_noise: float = 0.2,
         discount: float = 0.99,
+        one_pass: bool = False,
+        value_network: bool = False,
     ) -> None:
         check_arguments(POLICY_ARGUMENTS, locals())
         check_keywords("features_extractor_kwargs", features_extractor_kwargs or {}, features_extractor_class)
@@ -181,7 +186,9 @@ class CausalGDPPolicy(SavedPolicy):
             "sampling_steps": sampling_steps,
             "denoiser": denoiser,
             "denoiser_kwargs": denoiser_kwargs,
+            "one_pass": one_pass,
         }
+        self.value_network = value_network
         self.actor_kwargs = {**shared_kwargs, "net_arch": actor_arch, **self.diffusion_kwargs}
         self.critic_kwargs = {
             **shared_kwargs,
@@ -189,6 +196,7 @@ class CausalGDPPolicy(SavedPolicy):
             "net_arch": critic_arch,
             "n_critics": n_critics,
             "normalization": critic_normalization,
+            "value_network": value_network,
             "share_features_extractor": share_features_extractor,
         }
         self._build(lr_schedule)
@@ -199,7 +207,7 @@ class CausalGDPPolicy(SavedPolicy):
         self.has_image_state = any(
             is_image_space(space, normalized_image=not self.normalize_images) for space in _leaf_spaces(self.observation_space)
         )
-        self._acting: NumpyActing | None = None
+        self._acting: NumpyActing | OnePassActing | None = None
         self.register_buffer("reward_target", th.zeros(()))
         self.register_buffer("return_std", th.ones(()))
         self.register_buffer("guidance_ready", th.zeros(()))
@@ -309,6 +317,7 @@ class CausalGDPPolicy(SavedPolicy):
             normalize_observations=self.normalize_observations,
             share_features_extractor=self.share_features_extractor,
             world_model_net_arch=self.world_model_net_arch,
+            value_network=self.value_network,
             lr_schedule=self._dummy_schedule,  # not needed for loading the policy alone
             **self.diffusion_kwargs,
             **self.guidance_kwargs,

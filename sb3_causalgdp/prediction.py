@@ -7,7 +7,7 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.type_aliases import PyTorchObs
 
-from sb3_causalgdp.acceleration.acting import NumpyActing
+from sb3_causalgdp.acceleration.acting import NumpyActing, OnePassActing
 from sb3_causalgdp.checks import first_not_finite_index, fits_float32
 from sb3_causalgdp.networks import q_values
 
@@ -22,6 +22,9 @@ def act(policy: Policy, observation: PyTorchObs, deterministic: bool) -> th.Tens
     :return: Actions in [-1, 1], without exploration noise, shape ``(batch, d)``
     """
     acting = _numpy_acting(policy, observation)
+    if isinstance(acting, OnePassActing):
+        assert isinstance(observation, th.Tensor)
+        return th.from_numpy(acting(observation.float().flatten(1).numpy()))
     if acting is not None:
         assert isinstance(observation, th.Tensor)
         noise = candidate_noise(policy, len(observation), deterministic).cpu().numpy()
@@ -29,10 +32,12 @@ def act(policy: Policy, observation: PyTorchObs, deterministic: bool) -> th.Tens
         return th.as_tensor(actions, device=observation.device)
     with th.no_grad():
         features = policy.actor.features(observation)
+        if policy.actor.one_pass is not None:
+            return policy.actor.sample(features)
         return act_in_torch(policy, observation, features, candidate_noise(policy, len(features), deterministic))
 
 
-def _numpy_acting(policy: Policy, observation: PyTorchObs) -> NumpyActing | None:
+def _numpy_acting(policy: Policy, observation: PyTorchObs) -> NumpyActing | OnePassActing | None:
     """The fast path for few rows, where it covers this policy; made anew when the networks were moved or replaced."""
     if policy.training or not isinstance(observation, th.Tensor):
         return None
@@ -40,8 +45,9 @@ def _numpy_acting(policy: Policy, observation: PyTorchObs) -> NumpyActing | None
         return None
     if policy._acting is not None and not policy._acting.is_current(policy):
         policy._acting = None
-    if policy._acting is None and NumpyActing.covers(policy):
-        policy._acting = NumpyActing(policy)
+    kind = NumpyActing if policy.actor.one_pass is None else OnePassActing
+    if policy._acting is None and kind.covers(policy):
+        policy._acting = kind(policy)
     return policy._acting
 
 

@@ -13,7 +13,21 @@ from sb3_causalgdp.acceleration.fast_steps import FastSteps, n_threads_at_most
 from sb3_causalgdp.acceleration.gradients import Gradients, gradients_of
 from sb3_causalgdp.batches import Batches
 from sb3_causalgdp.causal.world_model import moves
-from sb3_causalgdp.losses import DenoisingTerms, critic_loss, denoising_loss, q_loss, quantile, td_target, world_model_loss
+from sb3_causalgdp.diffusion import Guidance
+from sb3_causalgdp.losses import (
+    DenoisingTerms,
+    advantage_weights,
+    critic_loss,
+    denoising_loss,
+    expectile_loss,
+    improved_actions,
+    improvement_weights,
+    q_loss,
+    quantile,
+    td_target,
+    trust_region_loss,
+    world_model_loss,
+)
 from sb3_causalgdp.networks import q_values
 from sb3_causalgdp.offline.replay import rows_of
 
@@ -50,6 +64,17 @@ class StepBatch(NamedTuple):
     """Of the world model and the actor: the same sample, or one of single steps where returns are of several."""
     next_actions: th.Tensor | None
     """Of the actor's moving average after the transitions, shape ``(batch, d)``; None if they are not known yet."""
+
+
+class Learned(NamedTuple):
+    """What the denoiser learns."""
+
+    observations: Any
+    actions: th.Tensor
+    """Clean ones, shape ``(batch, d)``."""
+    weights: th.Tensor | None
+    """Of the actions, shape ``(batch, 1)``; None where the Q term says what is better."""
+    guidance: Guidance | None
 
 
 class Updates:
@@ -104,6 +129,7 @@ class Updates:
         model = self.model
         # All that the steps depend on and that may change while it trains
         weights = (model.eta, model.denoising_weight, model.bound_penalty, model.q_scale)
+        weights += (model.expectile, model.advantage_temperature, model.improvement_step)
         rates = (model.tau, model.gamma, model.max_grad_norm, model.target_policy_noise, model.target_noise_clip)
         scales = (self.policy.state_guidance_scale, self.policy.outcome_guidance_scale)
         with n_threads_at_most(model.torch_threads, self.policy.has_image_state):
@@ -179,6 +205,10 @@ class Updates:
             next_actions = actor.sample(actor_features)
             if self.critic.normalizes_batches:
                 return next_actions, self.smoothed(next_actions)
+            if self.model.expectile is not None:
+                values = [self.critic.value(next_observations)]
+                target = td_target(values, replay_data.rewards, replay_data.dones, self.discounts(replay_data))
+                return next_actions[::n_actions], target
             critic_features = self.critic_target.extract_features(next_observations, self.critic_target.features_extractor)
             critic_features, smoothed = critic_features.repeat_interleave(n_actions, dim=0), self.smoothed(next_actions)
             next_q_values = q_values(self.critic_target, critic_features, smoothed)
@@ -227,6 +257,10 @@ class Updates:
         target_std, target_mean = th.std_mean(target, correction=0)
         target_std = th.where(moves(target_std, target_mean), target_std, 1.0)
         loss = critic_loss(q, target)
+        if self.model.expectile is not None:
+            with th.no_grad():
+                of_data = self.critic_target.smallest(observations, actions)
+            loss = loss + expectile_loss(self.critic.value(observations), of_data, self.model.expectile)
         return target_std, loss.detach(), gradients_of(self.critic, loss)
 
     # World model ----------------------------------------------------------------------------------------------------------
@@ -275,9 +309,14 @@ class Updates:
 
     def actor_gradients(self, transitions, next_actions: th.Tensor, climbed: int, guided: bool) -> tuple[Losses, Gradients]:
         denoising, q_term = self.actor_losses(transitions, next_actions, climbed, guided)
-        model = self.model
+        model, trust_region = self.model, denoising.trust_region
         loss = model.denoising_weight * denoising.loss + model.eta * q_term + model.bound_penalty * denoising.outside
-        losses = {"actor_loss": loss, "denoising_loss": denoising.loss, "q_loss": q_term, "bound_loss": denoising.outside}
+        losses = {"denoising_loss": denoising.loss, "q_loss": q_term, "bound_loss": denoising.outside}
+        if trust_region is not None:
+            # The behaviour model shares no weights with the network that acts
+            loss = denoising.loss + model.denoising_weight * trust_region + model.eta * q_term
+            losses["trust_region_loss"] = trust_region
+        losses = {"actor_loss": loss, **losses}
         return {name: value.detach() for name, value in losses.items()}, gradients_of(self.actor, loss)
 
     def actor_losses(
@@ -290,11 +329,32 @@ class Updates:
         :param guided: Whether the denoising term is steered
         :return: The denoising terms and the Q term
         """
-        observations = transitions.observations
-        features = self.actor.features(observations)
-        guidance = rule = None
+        actor, update = self.actor, self.model.actor_update
+        learned = self.imitated if update == "imitation" else self.of_data
+        observations, of_data, weights, guidance = learned(transitions, next_actions, climbed, guided)
+        features = actor.features(observations)
+        rule = self.policy.guidance_rule if guided else None
+        denoising = denoising_loss(
+            actor.denoiser, actor.schedule, features, of_data, guidance, rule, actor.is_continuous, weights
+        )
+        if weights is not None:
+            return denoising, th.zeros_like(denoising.loss)
+        actions = denoising.clean_actions if update == "one_step" else actor.sample(features)
+        if update == "trust_region":
+            loss = trust_region_loss(actor.denoiser, actor.schedule, features, actions, actor.is_continuous)
+            denoising = denoising._replace(trust_region=loss)
+        return denoising, self.q_term(observations, actions, of_data, climbed)
+
+    def of_data(self, transitions, next_actions: th.Tensor, climbed: int, guided: bool) -> Learned:
+        """
+        :param transitions: Sample of single steps
+        :param next_actions: After them
+        :param climbed: Index of the critic that is climbed
+        :param guided: Whether the denoising term is steered
+        :return: What the denoiser learns: the actions of the batch, all alike or by their advantage
+        """
+        observations, guidance, weights = transitions.observations, None, None
         if guided:
-            rule = self.policy.guidance_rule
             state, next_state = self.policy.causal_state(observations), self.policy.causal_state(transitions.next_observations)
             if self.model.optimize_memory_usage:
                 # In place of an episode's last observation, which this buffer does not keep
@@ -302,10 +362,33 @@ class Updates:
                     predicted, _ = self.world_model.predict_next_state(state, transitions.actions)
                 next_state = th.where(transitions.dones > 0.0, predicted, next_state)
             guidance = self.policy.make_guidance(state, next_state, next_actions, climbed)
-        actor, of_data = self.actor, transitions.actions
-        denoising = denoising_loss(actor.denoiser, actor.schedule, features, of_data, guidance, rule, actor.is_continuous)
-        actions = denoising.clean_actions if self.model.actor_update == "one_step" else actor.sample(features)
-        return denoising, self.q_term(observations, actions, of_data, climbed)
+        if self.model.actor_update == "weighted":
+            with th.no_grad():
+                advantages = self.critic_target.smallest(observations, transitions.actions) - self.critic.value(observations)
+                weights = advantage_weights(advantages, self.model.advantage_temperature)
+        return Learned(observations, transitions.actions, weights, guidance)
+
+    def imitated(self, transitions, next_actions: th.Tensor, climbed: int, guided: bool) -> Learned:
+        """
+        :param transitions: Sample of single steps
+        :param next_actions: After them, where the TD target has sampled the actor already
+        :param climbed: Index of the critic that is climbed
+        :param guided: Whether the denoising term is steered
+        :return: What the denoiser learns: its own actions after the transitions, a step further up
+        """
+        observations = transitions.next_observations
+        with th.no_grad():
+            features = self.critic.extract_features(observations, self.critic.features_extractor)
+        with th.enable_grad():
+            actions = next_actions.detach().requires_grad_()
+            (values,) = q_values(self.critic, features, actions, slice(climbed, climbed + 1))
+            (gradient,) = th.autograd.grad(values.sum(), actions)
+        with th.no_grad():
+            improved = improved_actions(next_actions, gradient, self.model.improvement_step)
+            both = [th.cat(q_values(self.critic, features, one), dim=1) for one in (next_actions, improved)]
+            weights = improvement_weights(*(values.amin(dim=1, keepdim=True) for values in both))
+        guidance = self.policy.acting_guidance(self.policy.causal_state(observations), improved) if guided else None
+        return Learned(observations, improved, weights, guidance)
 
     def q_term(self, observations, actions: th.Tensor, of_data: th.Tensor, climbed: int) -> th.Tensor:
         """

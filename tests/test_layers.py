@@ -15,7 +15,7 @@ LAYERS = [
     {"saving.algorithm"},
     {"callbacks", "checkpoints", "knowledge"},
     {"callbacks.world_model", "updates"},
-    {"losses", "batches", "callbacks.diagnostics", "questions", "acceleration.fast_steps"},
+    {"losses", "batches", "distillation", "callbacks.diagnostics", "questions", "acceleration.fast_steps"},
     {"policies", "acceleration.device_replay", "acceleration.cuda_graphs", "acceleration.gradients"},
     {"prediction", "acceleration.product_pass"},
     {"networks", "acceleration.acting"},
@@ -41,7 +41,7 @@ LAYERS = [
         "saving.archives",
         "extractors",
     },
-    {"saving.numpy_pickles", "acceleration.switch", "acceleration", "saving", "moved"},
+    {"saving.numpy_pickles", "acceleration.switch", "acceleration", "saving", "moved", "presets"},
 ]
 # Graphs and answers are drawn by pictures that know them: this file imports those late, and no other does
 LATE = {("causal.drawing", "causal.plots")}

@@ -204,6 +204,68 @@ class NumpyActing:
         return self.features.backward(gradient, features).T
 
 
+class OnePassActing:
+    """
+    What a policy with a one-pass network does, for few rows.
+
+    :param policy: A policy that :meth:`covers` accepts
+    """
+
+    def __init__(self, policy: Policy) -> None:
+        self.features = Features(policy)
+        self.layers = [(view(layer.weight), view(layer.bias)[:, None]) for layer in _linear(policy)]
+        self.activation = ACTIVATIONS[policy.activation_fn].value
+        self._network = policy.actor.one_pass
+        self._tensors = [*self._network.parameters(), *policy.critic_target.features_extractor.buffers()]
+        self._addresses = list(map(th.Tensor.data_ptr, self._tensors))
+
+    def __reduce__(self) -> tuple[type, tuple]:
+        return type(None), ()
+
+    def is_current(self, policy: Policy) -> bool:
+        """
+        :param policy: The policy
+        :return: Whether the views are still those of its networks, which may have been moved or replaced
+        """
+        return policy.actor.one_pass is self._network and list(map(th.Tensor.data_ptr, self._tensors)) == self._addresses
+
+    @staticmethod
+    def covers(policy: Policy) -> bool:
+        """
+        :param policy: A policy with a one-pass network
+        :return: Whether this class can act for it: vectors of observations, plain layers in float32 on a CPU
+        """
+        *hidden, squash = policy.actor.one_pass
+        return (
+            switch.is_on()
+            and policy.device.type == "cpu"
+            and type(policy.observation_space) is spaces.Box
+            and not policy.has_image_state
+            and _shows_vectors(policy.actor.features_extractor)
+            and policy.activation_fn in ACTIVATIONS
+            and type(squash) is nn.Tanh
+            and has_plain_layers(hidden, policy.activation_fn)
+            and all(parameter.dtype == th.float32 for parameter in policy.actor.one_pass.parameters())
+        )
+
+    def __call__(self, state: np.ndarray) -> np.ndarray:
+        """
+        :param state: The observations, float32, shape ``(batch, n)``
+        :return: Actions in [-1, 1], shape ``(batch, d)``
+        """
+        (weight, bias), *layers = self.layers
+        hidden = weight @ self.features(state.T)
+        hidden += bias
+        for weight, bias in layers:
+            hidden = weight.dot(self.activation(hidden))
+            hidden += bias
+        return np.ascontiguousarray(np.tanh(hidden).T)
+
+
+def _linear(policy: Policy) -> list[nn.Linear]:
+    return [module for module in policy.actor.one_pass if isinstance(module, nn.Linear)]
+
+
 def _shows_vectors(extractor: nn.Module) -> bool:
     """Whether it gives vectors of observations, as they are or standardised."""
     return type(extractor.extractor if type(extractor) is StandardizedExtractor else extractor) is FlattenExtractor

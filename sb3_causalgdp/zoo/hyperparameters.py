@@ -13,6 +13,7 @@ from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.common.utils import LinearSchedule
 
 from sb3_causalgdp import CausalGDP
+from sb3_causalgdp.presets import preset
 
 DISTRIBUTION = "sb3_causalgdp"
 FILE_NAME = "causalgdp.yml"
@@ -85,13 +86,27 @@ def read_entry(entry: Any) -> dict[str, Any]:
     """
     if not isinstance(entry, Mapping):
         raise ValueError(f"the entry must be a mapping of hyperparameters, got {entry!r}")
+    entry = _without_preset(entry)
     _check_keys(entry)
     arguments = constructor_arguments()
     return {key: _as_declared(key, read_numbers(value), arguments) for key, value in entry.items()}
 
 
+def _without_preset(entry: Mapping[str, Any]) -> Mapping[str, Any]:
+    """The same with a preset's arguments, of which those of the entry win."""
+    if "preset" not in entry:
+        return entry
+    changes = {key: value for key, value in entry.items() if key != "preset"}
+    named = entry["preset"] if isinstance(entry["preset"], Mapping) else {"name": entry["preset"]}
+    if "name" not in named or not set(named) <= {"name", "offline", "guided"}:
+        raise ValueError(f"preset must be a name, or a mapping of name, offline and guided, got {entry['preset']!r}")
+    if not isinstance(changes.get("policy_kwargs") or {}, Mapping):
+        raise ValueError(f"policy_kwargs must be a mapping beside a preset, got {changes['policy_kwargs']!r}")
+    return preset(**named, **changes)
+
+
 def _check_keys(entry: Mapping[str, Any]) -> None:
-    known = {*constructor_arguments(), *ZOO_KEYS}
+    known = {*constructor_arguments(), *ZOO_KEYS, "preset"}
     for key in entry:
         if key in COMMAND_LINE_KEYS:
             raise ValueError(f"{key!r} cannot be in the YAML file: it is the command line's {COMMAND_LINE_KEYS[key]}")
