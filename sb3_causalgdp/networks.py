@@ -305,7 +305,7 @@ class DiffusionActor(PickledAlone, BasePolicy):
         :param action: Shape ``(batch, d)``
         :return: Actions in [-1, 1], shape ``(batch, d)``
         """
-        step = th.full((len(action),), self.adapting_step, device=action.device)
+        step = th.full(action.shape[:1], self.adapting_step, device=action.device)
         noisy = self.schedule.add_noise(action, th.zeros_like(action), step)
         return self.schedule.clean_estimate(noisy, bind(self.denoiser, features)(noisy, step), step).clamp(-1.0, 1.0)
 

@@ -1,5 +1,6 @@
 """Networks of CausalGDP, what they are fed and how they are guided, as one SB3 policy."""
 
+import os
 from collections.abc import Sequence
 from typing import Any
 
@@ -15,16 +16,25 @@ from stable_baselines3.common.torch_layers import (
     get_actor_critic_arch,
 )
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
+from stable_baselines3.common.vec_env import VecNormalize
 from torch import nn
 
 from sb3_causalgdp.acceleration.acting import NumpyActing, OnePassActing
 from sb3_causalgdp.acceleration.activations import fast
 from sb3_causalgdp.arguments import POLICY_ARGUMENTS, check_arguments, check_keywords
-from sb3_causalgdp.causal import CausalGuidance, LinearisedGuidance, MaskedWorldModel, ReturnTarget, RewardTarget
+from sb3_causalgdp.causal import (
+    CausalGuidance,
+    LinearisedGuidance,
+    MaskedWorldModel,
+    ReturnTarget,
+    RewardTarget,
+    TransitionVariables,
+)
 from sb3_causalgdp.causal.guidance import OutcomeTarget
 from sb3_causalgdp.checks import is_finite
 from sb3_causalgdp.diffusion import GuidanceRule
 from sb3_causalgdp.divergence import TrainingDivergedError
+from sb3_causalgdp.export import export_policy
 from sb3_causalgdp.extractors import StandardizedExtractor
 from sb3_causalgdp.networks import Critic, DiffusionActor, activation_class, q_values
 from sb3_causalgdp.prediction import act, check_observation, fixed_noise
@@ -505,6 +515,28 @@ class CausalGDPPolicy(SavedPolicy):
         return action
 
     # Files --------------------------------------------------------------------------------------------------------------
+
+    def export(
+        self,
+        path: str | os.PathLike[str],
+        guided: bool | None = None,
+        deterministic: bool = True,
+        vec_normalize: VecNormalize | None = None,
+    ) -> None:
+        """
+        Write what :meth:`predict` computes to a file that runs without this package. ``model.export`` also knows the names of
+        the environment and its ``VecNormalize``.
+
+        :param path: The file; its suffix says of which kind: ``.onnx``, ``.pt`` (TorchScript) or ``.pt2`` (``torch.export``)
+        :param guided: Whether actions are steered by the causal guidance, None for what :meth:`predict` does now
+        :param deterministic: Whether the noise is fixed; if not, it is an input beside the observation
+        :param vec_normalize: Normalises the observations in the file, which then takes them as the environment gives them
+        :raises ValueError: If the suffix is unknown, there is no guidance yet, or the policy cannot be traced
+        :raises ImportError: If a package for ONNX is missing
+        :raises RuntimeError: If the file gives other actions than :meth:`predict`
+        """
+        names = tuple(f"action[{index}]" for index in range(self.actor.action_dim))
+        export_policy(self, path, TransitionVariables(self.state_names(), names), guided, deterministic, vec_normalize)
 
     @classmethod
     def known_classes(cls) -> Known:

@@ -1,5 +1,6 @@
 """How a policy acts: on the best of several candidates, steered once more; in numpy where that is faster."""
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,9 @@ from sb3_causalgdp.networks import q_values
 
 Policy = Any  # a CausalGDPPolicy, whose file imports this one
 
+# Older versions of PyTorch do not tell
+_is_exporting: Callable[[], bool] = getattr(th.compiler, "is_exporting", lambda: False)
+
 
 def act(policy: Policy, observation: PyTorchObs, deterministic: bool) -> th.Tensor:
     """
@@ -20,7 +24,13 @@ def act(policy: Policy, observation: PyTorchObs, deterministic: bool) -> th.Tens
     :param observation: Observations as SB3 gives them to policies
     :param deterministic: Whether the candidates' noise is the same at every call
     :return: Actions in [-1, 1], without exploration noise, shape ``(batch, d)``
+    :raises RuntimeError: If PyTorch traces or exports it
     """
+    if is_traced():
+        raise RuntimeError(
+            "The policy cannot be traced or exported by PyTorch, which would take its actions for constants: "
+            "use model.export('policy.onnx') or policy.export, also for .pt (TorchScript) and .pt2 (torch.export)"
+        )
     acting = _numpy_acting(policy, observation)
     if isinstance(acting, OnePassActing):
         assert isinstance(observation, th.Tensor)
@@ -37,6 +47,13 @@ def act(policy: Policy, observation: PyTorchObs, deterministic: bool) -> th.Tens
         return act_in_torch(policy, observation, features, candidate_noise(policy, len(features), deterministic))
 
 
+def is_traced() -> bool:
+    """
+    :return: Whether PyTorch is recording what is computed for another program: numpy and gradients would leave no trace
+    """
+    return th.jit.is_tracing() or _is_exporting() or th.onnx.is_in_onnx_export()
+
+
 def _numpy_acting(policy: Policy, observation: PyTorchObs) -> NumpyActing | OnePassActing | None:
     """The fast path for few rows, where it covers this policy; made anew when the networks were moved or replaced."""
     if policy.training or not isinstance(observation, th.Tensor):
@@ -51,19 +68,22 @@ def _numpy_acting(policy: Policy, observation: PyTorchObs) -> NumpyActing | OneP
     return policy._acting
 
 
-def act_in_torch(policy: Policy, observation: PyTorchObs, features: th.Tensor, noise: th.Tensor) -> th.Tensor:
+def act_in_torch(
+    policy: Policy, observation: PyTorchObs, features: th.Tensor, noise: th.Tensor, guided: bool | None = None
+) -> th.Tensor:
     """
     :param policy: The policy
     :param observation: Observations as SB3 gives them to policies
     :param features: The actor's features of these
     :param noise: Of the candidates, see :func:`candidate_noise`
+    :param guided: Whether to steer, None for what the policy says now
     :return: Actions in [-1, 1], shape ``(batch, d)``
     """
     critic_features = policy.critic_target.extract_features(observation, policy.critic_target.features_extractor)
     candidates = policy.actor.sample(features.repeat_interleave(policy.n_action_candidates, dim=0), noise)
     best = _best_candidate(policy, critic_features, candidates)
     action = candidates[best]
-    if not policy.is_guided:
+    if not (policy.is_guided if guided is None else guided):
         return action
     # From the same noise, the guided chain ends at the best candidate, moved by the guidance
     guidance = policy.acting_guidance(policy.causal_state(observation), action)
@@ -101,7 +121,7 @@ def candidate_noise(policy: Policy, n_observations: int, deterministic: bool) ->
 def _best_candidate(policy: Policy, critic_features: th.Tensor, actions: th.Tensor) -> th.Tensor:
     """Row of the candidate with the largest of the smallest target Q, for each observation."""
     n_candidates = policy.n_action_candidates
-    first = th.arange(0, len(actions), n_candidates, device=actions.device)
+    first = th.arange(0, actions.shape[0], n_candidates, device=actions.device)
     if n_candidates == 1:
         return first
     repeated = critic_features.repeat_interleave(n_candidates, dim=0)

@@ -17,6 +17,7 @@ LAYERS = [
     {"callbacks.world_model", "updates"},
     {"losses", "batches", "distillation", "callbacks.diagnostics", "questions", "acceleration.fast_steps"},
     {"policies", "acceleration.device_replay", "acceleration.cuda_graphs", "acceleration.gradients"},
+    {"export"},
     {"prediction", "acceleration.product_pass"},
     {"networks", "acceleration.acting"},
     {"saving.policies", "acceleration.numpy_networks"},

@@ -163,7 +163,7 @@ def sample(
     if noise is None:
         width = denoiser.action_dim if action_dim is None else action_dim  # type: ignore[attr-defined]
         noise = th.randn(n_noises, len(observation), width, dtype=observation.dtype, device=observation.device)
-    if noise.ndim != 3 or noise.shape[:2] != (n_noises, len(observation)):
+    if noise.ndim != 3 or noise.shape[:2] != (n_noises, observation.shape[0]):
         raise ValueError(f"noise must have the shape ({n_noises}, {len(observation)}, d), got {tuple(noise.shape)}")
     if guidance is not None and len(rule.scales) not in (1, schedule.n_steps):
         raise ValueError(f"guidance_scale must hold 1 or {schedule.n_steps} values, got {len(rule.scales)}")

@@ -14,10 +14,12 @@ from stable_baselines3.common.base_class import maybe_make_env
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.save_util import open_path, recursive_getattr
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
+from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_causalgdp.checkpoints import TrainingCheckpointCallback, resume, save_checkpoint
 from sb3_causalgdp.checkpoints.checkpoint import all_callbacks, bookkeeping_of
 from sb3_causalgdp.divergence import ParametersError, TrainingDivergedError, check_optimizer_state, first_not_finite
+from sb3_causalgdp.export import export_policy
 from sb3_causalgdp.files import write_bytes
 from sb3_causalgdp.knowledge import DiscoveringAlgorithm
 from sb3_causalgdp.offline.algorithm import callback_list
@@ -94,6 +96,29 @@ class SavedAlgorithm(DiscoveringAlgorithm):
             found = self.policy.first_not_finite(state) if name == "policy" else first_not_finite(state, name)
             if found is not None:
                 raise TrainingDivergedError(*found, self._n_updates)
+
+    def export(
+        self,
+        path: str | os.PathLike[str],
+        guided: bool | None = None,
+        deterministic: bool = True,
+        vec_normalize: VecNormalize | str | None = "auto",
+    ) -> None:
+        """
+        Write what ``predict`` computes to a file that runs without this package, from the environment's observations to its
+        actions: best of the candidates and guidance, normalisation of observations and scaling of actions are in it.
+
+        :param path: The file; its suffix says of which kind: ``.onnx``, ``.pt`` (TorchScript) or ``.pt2`` (``torch.export``)
+        :param guided: Whether actions are steered by the causal guidance, None for what ``predict`` does now
+        :param deterministic: Whether the noise is fixed; if not, it is an input beside the observation
+        :param vec_normalize: Normalises the observations in the file. ``"auto"`` is the model's environment where it is one;
+            None leaves them as the policy takes them
+        :raises ValueError: If the suffix is unknown, there is no guidance yet, or the policy cannot be traced
+        :raises ImportError: If a package for ONNX is missing
+        :raises RuntimeError: If the file gives other actions than ``predict``
+        """
+        normalizer = self._vec_normalize_env if isinstance(vec_normalize, str) else vec_normalize
+        export_policy(self.policy, path, self.transition_variables, guided, deterministic, normalizer)
 
     def save(
         self,
