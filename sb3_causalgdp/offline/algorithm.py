@@ -24,8 +24,9 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_no
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from sb3_causalgdp.files import saved_when_done
+from sb3_causalgdp.offline.callbacks import note_success
 from sb3_causalgdp.offline.loaded_buffers import check_loaded_buffer, in_columns
-from sb3_causalgdp.offline.observations import flat_space, flattened_space, layout_name, same_layout
+from sb3_causalgdp.offline.observations import flat_space, flattened_space, key_names, layout_name, same_layout
 from sb3_causalgdp.offline.preload import (
     check_buffer,
     copy_rows,
@@ -132,7 +133,7 @@ class OfflineToOnlineAlgorithm(OffPolicyAlgorithm):
         learns online after ``set_env``. Dictionaries of observations are flattened, except for a ``MultiInputPolicy``.
 
         Arrays and tables do not tell their spaces. What is not given is inferred, with a warning that says what: observations
-        of any numbers, and actions between the smallest and the largest.
+        of any numbers, and actions between the smallest and the largest. The names of the columns are those of the variables.
 
         :param source: As for :meth:`preload`; only its spaces are read
         :param policy: The policy model to use
@@ -145,12 +146,14 @@ class OfflineToOnlineAlgorithm(OffPolicyAlgorithm):
         """
         if "states" in kwargs and not isinstance(source, Table):
             source = Table(source, **{name: kwargs.pop(name) for name in signature(Table).parameters if name in kwargs})
-        observation_space, action_space = spaces_of(open_source(source), observation_space, action_space)
+        opened = open_source(source)
+        observation_space, action_space = spaces_of(opened, observation_space, action_space)
         layout = observation_space
+        names = opened.state_names or key_names(layout), opened.action_names
         policy_class = cls.policy_aliases.get(policy) if isinstance(policy, str) else policy
         if not (policy_class is not None and issubclass(policy_class, cls.policy_aliases["MultiInputPolicy"])):
             layout, observation_space = observation_space, flat_space(observation_space)
-        model = cls(policy, SpacesEnv(observation_space, action_space, n_envs), **kwargs)
+        model = cls(policy, SpacesEnv(observation_space, action_space, n_envs, *names), **kwargs)
         model.env, model.observation_layout = None, layout if layout is not observation_space else None
         return model
 
@@ -172,6 +175,12 @@ class OfflineToOnlineAlgorithm(OffPolicyAlgorithm):
         self.observation_layout = layout
         if normalizer is not None and self.offline_buffer is not None:
             prime_normalizer(normalizer, self.offline_buffer, (0, self.offline_buffer.size()), self._offline_marks)
+
+    def _update_info_buffer(self, infos: list[dict[str, Any]], dones: np.ndarray | None = None) -> None:
+        if dones is not None and dones.any():
+            for info in infos:
+                note_success(info)
+        super()._update_info_buffer(infos, dones)
 
     def _checked_layout(self, env: GymEnv) -> spaces.Space | None:
         """What the observations of an environment are flattened from, by key; the model's own where that cannot be told."""

@@ -11,11 +11,25 @@ from sb3_causalgdp.files import replaced_when_done
 from sb3_causalgdp.offline.scores import NormalizedScore, normalized_score
 
 
+def note_success(info: dict[str, Any]) -> None:
+    """
+    :param info: Of the last step of an episode. What Gymnasium-Robotics' mazes and hands call ``success`` is noted as
+        ``is_success``, from which SB3 computes success rates
+    """
+    if "success" in info:
+        info.setdefault("is_success", info["success"])
+
+
 class WholeEvalCallback(EvalCallback):
     """
     SB3's :class:`~stable_baselines3.common.callbacks.EvalCallback`, whose ``evaluations.npz`` is replaced only once the new
-    one is complete.
+    one is complete, and which also knows the success of environments that call it ``success``.
     """
+
+    def _log_success_callback(self, locals_: dict[str, Any], globals_: dict[str, Any]) -> None:
+        if locals_["done"]:
+            note_success(locals_["info"])
+        super()._log_success_callback(locals_, globals_)
 
     def _on_step(self) -> bool:
         path = self.log_path

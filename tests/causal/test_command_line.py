@@ -253,11 +253,12 @@ def test_the_whole_way_from_a_minari_dataset(minari, capsys):
 
 def test_minari_dataset_that_is_not_there(minari, capsys):
     assert "no Minari dataset 'no/such-v0' on this machine" in error_of(capsys, "no/such-v0")
+    assert "datasets make --help` lists datasets" in error_of(capsys, "no/such-v0")
 
 
 def test_minari_is_not_installed(monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "minari", None)
-    assert 'pip install "sb3_causalgdp[offline]"' in error_of(capsys, "D4RL/door/human-v2")
+    assert 'pip install "minari[hdf5]" gymnasium-robotics' in error_of(capsys, "D4RL/door/human-v2")
 
 
 # The command ------------------------------------------------------------------------------------------------------------
@@ -430,6 +431,27 @@ def test_the_picture_takes_the_options_of_a_view(arrays, tmp_path, capsys):
     for option, message in (("colour=red", "unknown options ['colour'] of a picture"), ("kind=pie", "kind must be one of")):
         assert message in error_of(capsys, *command, option)
     assert "--plot-kwargs need --plot FILE" in error_of(capsys, arrays, "--plot-kwargs", "causes=2")
+
+
+def test_a_buffer_s_variables_get_names(tmp_path, capsys):
+    rng = np.random.default_rng(0)
+    arrays = {name: rng.normal(size=(400, 2)) for name in ("observations", "next_observations")}
+    np.savez(tmp_path / "rows.npz", **arrays, actions=rng.normal(size=(400, 1)), rewards=rng.normal(size=400))
+    main(
+        [
+            str(tmp_path / "rows.npz"),
+            "--state-names",
+            "level, heat",
+            "--action-names=valve",
+            "--json",
+            str(tmp_path / "g.json"),
+        ]
+    )
+    assert CausalGraph.load(tmp_path / "g.json").variables.names[:3] == ("level", "heat", "valve")
+    said = error_of(capsys, tmp_path / "rows.npz", "--state-names", "level")
+    assert said.endswith("--state-names must be 2 names for obs[0], obs[1], got 'level'")
+    said = error_of(capsys, tmp_path / "rows.npz", "--state", "a", "--action", "b", "--reward", "c", "--state-names", "level")
+    assert "the names of a table are those of its columns" in said
 
 
 def test_minari_datasets_that_are_damaged(minari, capsys):
