@@ -79,6 +79,17 @@ class DiscoveringAlgorithm(OfflineToOnlineAlgorithm):
             # Every second one goes, so that what is left spans the whole training; the newest stays
             self.causal_graph_history = self.causal_graph_history[::-2][::-1]
 
+    def progress_parts(self) -> list[str]:
+        """
+        :return: What the progress bar says, the most important first: returns, edges and age of the causal graph
+        """
+        graph = self._causal_graph
+        if graph is None or graph.num_timesteps is None:
+            return [*super().progress_parts(), "no graph yet"]
+        edges = "1 edge" if graph.n_edges == 1 else f"{graph.n_edges} edges"
+        age = self.n_environment_steps - graph.num_timesteps
+        return [*super().progress_parts(), edges, f"graph {age:,} steps old"]
+
     def _setup_discovery(self) -> None:
         try:
             self.discovery = make_discovery(self.causal_discovery, **self.causal_discovery_kwargs)
