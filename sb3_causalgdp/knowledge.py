@@ -3,6 +3,7 @@
 import io
 import pathlib
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any, TypeVar
 
 import torch as th
@@ -62,6 +63,9 @@ class DiscoveringAlgorithm(OfflineToOnlineAlgorithm):
         :param graph: The graph, on this model's variables
         :raises ValueError: If the graph is about other variables
         """
+        if graph.variables == self._indices:
+            # Found on a buffer, which has no names
+            graph = replace(graph, variables=self.transition_variables)
         if graph.variables != self.transition_variables:
             raise ValueError(
                 f"The graph is about {graph.variables.names}, but this model's variables are {self.transition_variables.names}"
@@ -76,6 +80,17 @@ class DiscoveringAlgorithm(OfflineToOnlineAlgorithm):
         if len(self.causal_graph_history) > self.GRAPHS_IN_HISTORY:
             # Every second one goes, so that what is left spans the whole training; the newest stays
             self.causal_graph_history = self.causal_graph_history[::-2][::-1]
+
+    def progress_parts(self) -> list[str]:
+        """
+        :return: What the progress bar says, the most important first: returns, edges and age of the causal graph
+        """
+        graph = self._causal_graph
+        if graph is None or graph.num_timesteps is None:
+            return [*super().progress_parts(), "no graph yet"]
+        edges = "1 edge" if graph.n_edges == 1 else f"{graph.n_edges} edges"
+        age = self.n_environment_steps - graph.num_timesteps
+        return [*super().progress_parts(), edges, f"graph {age:,} steps old"]
 
     def _setup_discovery(self) -> None:
         try:
@@ -100,7 +115,8 @@ class DiscoveringAlgorithm(OfflineToOnlineAlgorithm):
         if self._statistics_made_by is None:
             # A loaded model keeps the names under which it was trained
             found = found_names(self.env)
-            self.state_names = self.state_names or (None if self.policy.has_image_state else found[0])
+            is_known = not self.policy.has_image_state and len(found[0] or ()) == len(self.policy.state_names())
+            self.state_names = self.state_names or (found[0] if is_known else None)
             self.action_names = self.action_names or found[1]
         states, actions = self.policy.state_names(), tuple(f"action[{index}]" for index in range(self.actor.action_dim))
         for argument, indices in (("state_names", states), ("action_names", actions)):

@@ -8,6 +8,8 @@ import gymnasium as gym
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper, VecFrameStack, VecTransposeImage
 
+from sb3_causalgdp.offline.observations import key_names
+
 Names = tuple[str, ...]
 
 _BIPED_LEGS = [f"{what}{joint} {leg}" for leg in (1, 2) for joint in ("hip", "knee") for what in ("", "vel ")]
@@ -65,49 +67,77 @@ _BALL = (*(f"quaternion {axis}" for axis in "wxyz"), *(f"vel rotation {axis}" fo
 
 def found_names(env: VecEnv | gym.Env | None) -> tuple[Names | None, Names | None]:
     """
-    Names of the components of a flat observation and of the actions: the attributes ``state_names`` and ``action_names`` of
-    the environment or of one of its wrappers; else the joints and actuators of MuJoCo's models; else those that Gymnasium
-    documents for its own environments. A wrapper that changes observations hides what lies below, unless it has the attribute.
+    Names of the components of an observation and of the actions: the attributes ``state_names`` and ``action_names`` of
+    the environment or of one of its wrappers; else the keys of a dictionary, also of a flattened one; else the joints and
+    actuators of MuJoCo's models; else those that Gymnasium documents for its own environments. A wrapper that changes
+    observations hides what lies below, unless it has the attribute.
 
     :param env: The environment, or several of one kind
     :return: Of the states and of the actions; None for those that were not found
     """
-    one = _first_of(env)
-    if one is None:
-        return None, None
-    found = []
-    for attribute, space, own in (
-        ("state_names", one.observation_space, _state_names),
-        ("action_names", one.action_space, _action_names),
-    ):
-        names = _attribute_of(one, attribute)
-        if names is None and not _is_changed(one, attribute):
-            names = own(one.unwrapped)
-        found.append(names if names is not None and _fit(names, space) else None)
-    return found[0], found[1]
-
-
-def _first_of(env: VecEnv | gym.Env | None) -> gym.Env | None:
     while isinstance(env, VecEnvWrapper):
         if isinstance(env, VecFrameStack | VecTransposeImage):
-            return None
+            return None, None
         env = env.venv
-    if isinstance(env, DummyVecEnv):
-        return env.envs[0]
-    if isinstance(env, VecEnv):
-        # In other processes: what Gymnasium makes of the same id, without the wrappers that may lie around it there
-        spec = next(iter(env.get_attr("spec")), None) if env.has_attr("spec") else None
-        own = spec is not None and str(spec.entry_point).startswith("gymnasium.")
-        return gym.make(spec.id) if spec is not None and own else None
-    return env
+    if isinstance(env, VecEnv) and not isinstance(env, DummyVecEnv):
+        found = _told_by(env)
+    else:
+        found = _of_one(env.envs[0] if isinstance(env, DummyVecEnv) else env)
+    states, actions = found
+    # A key may have the name of an action
+    return states, None if states and actions and set(states) & set(actions) else actions
 
 
-def _attribute_of(env: gym.Env, attribute: str) -> Names | None:
-    if not env.has_wrapper_attr(attribute):
-        return None
-    names = env.get_wrapper_attr(attribute)
-    names = names() if callable(names) else names
+def _told_by(venv: VecEnv) -> tuple[Names | None, Names | None]:
+    """What environments in other processes say, else what Gymnasium makes of the same id, without wrappers around it there."""
+    told = [
+        _checked(_as_names(venv.get_attr(attribute)[0]), space) if venv.has_attr(attribute) else None
+        for attribute, space in (("state_names", venv.observation_space), ("action_names", venv.action_space))
+    ]
+    spec = next(iter(venv.get_attr("spec")), None) if venv.has_attr("spec") else None
+    is_gymnasiums = spec is not None and str(spec.entry_point).startswith("gymnasium.")
+    own = _of_one(gym.make(spec.id)) if spec is not None and is_gymnasiums else (None, None)
+    keys = _checked(key_names(venv.observation_space), venv.observation_space)
+    return told[0] or keys or _checked(own[0], venv.observation_space), told[1] or _checked(own[1], venv.action_space)
+
+
+def _of_one(env: gym.Env | None) -> tuple[Names | None, Names | None]:
+    if env is None:
+        return None, None
+    states, actions = (_names_in(env, attribute) for attribute in ("state_names", "action_names"))
+    if states is None:
+        states = _names_of_keys(env)
+    if states is None and not _is_changed(env, "state_names"):
+        states = _state_names(env.unwrapped)
+    if actions is None and not _is_changed(env, "action_names"):
+        actions = _action_names(env.unwrapped)
+    return _checked(states, env.observation_space), _checked(actions, env.action_space)
+
+
+def _names_in(env: gym.Env, attribute: str) -> Names | None:
+    return _as_names(env.get_wrapper_attr(attribute)) if env.has_wrapper_attr(attribute) else None
+
+
+def _as_names(value: Any) -> Names | None:
+    names = value() if callable(value) else value
     return None if names is None or isinstance(names, str) else tuple(str(name) for name in names)
+
+
+def _names_of_keys(env: gym.Env) -> Names | None:
+    """Of a dictionary, which may be flattened."""
+    while not isinstance(env.observation_space, spaces.Dict):
+        if not (isinstance(env, gym.Wrapper) and (_keeps_numbers(env) or env.observation_space == env.env.observation_space)):
+            return None
+        env = env.env
+    known = {} if _is_changed(env, "state_names") else _known_keys(env.unwrapped)
+    return key_names(env.observation_space, known)
+
+
+def _known_keys(env: gym.Env) -> dict[str, tuple[str, ...]]:
+    if env.spec is None or not (type(env).__module__.startswith("gymnasium_robotics.") and "PointMaze" in env.spec.name):
+        return {}
+    points = {key: (f"{name} x", f"{name} y") for key, name in (("achieved_goal", "achieved"), ("desired_goal", "goal"))}
+    return {"observation": ("x", "y", "vel x", "vel y"), **points}
 
 
 def _is_changed(env: gym.Env, attribute: str) -> bool:
@@ -115,15 +145,22 @@ def _is_changed(env: gym.Env, attribute: str) -> bool:
     space = "observation_space" if attribute == "state_names" else "action_space"
     changes = gym.ObservationWrapper if attribute == "state_names" else gym.ActionWrapper
     while isinstance(env, gym.Wrapper):
-        rescaled = type(env).__name__ in ("NormalizeObservation", "RescaleObservation", "RescaleAction", "ClipAction")
-        if isinstance(env, changes) and not rescaled and getattr(env, space) != getattr(env.env, space):
+        if isinstance(env, changes) and not _keeps_numbers(env) and getattr(env, space) != getattr(env.env, space):
             return True
         env = env.env
     return False
 
 
-def _fit(names: Names, space: spaces.Space) -> bool:
-    return isinstance(space, spaces.Box) and space.shape == (len(names),) and len(set(names)) == len(names)
+def _keeps_numbers(env: gym.Env) -> bool:
+    """Whether they are the same ones in the same order, and at most scaled."""
+    names = ("NormalizeObservation", "RescaleObservation", "RescaleAction", "ClipAction", "FlattenObservation")
+    return type(env).__name__ in names
+
+
+def _checked(names: Names | None, space: spaces.Space) -> Names | None:
+    if names is None or len(set(names)) != len(names) or "reward" in names or not isinstance(space, spaces.Box | spaces.Dict):
+        return None
+    return names if space.is_np_flattenable and spaces.flatdim(space) == len(names) else None
 
 
 def _known(env: gym.Env, which: int) -> Names | None:

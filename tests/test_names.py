@@ -1,3 +1,4 @@
+from dataclasses import replace
 from pathlib import Path
 
 import gymnasium as gym
@@ -8,6 +9,7 @@ from stable_baselines3.common.vec_env import SubprocVecEnv, VecFrameStack, VecNo
 
 from sb3_causalgdp import CausalGDP
 from sb3_causalgdp.causal import TransitionVariables
+from sb3_causalgdp.causal.sources import FlatSpace
 from sb3_causalgdp.names import found_names
 
 MUJOCO = [
@@ -126,7 +128,87 @@ def test_dict_observations_keep_their_keys():
         def observation(self, observation):
             return {"position": observation}
 
-    assert found_names(AsDict(gym.make("Pendulum-v1"))) == (None, ("torque",))
+    keyed = AsDict(gym.make("Pendulum-v1"))
+    assert found_names(keyed) == (("position[0]", "position[1]", "position[2]"), ("torque",))
+    # The same numbers under the same names when they are flattened
+    assert found_names(gym.wrappers.FlattenObservation(keyed)) == found_names(keyed)
+
+
+TANK = gym.spaces.Dict({name: gym.spaces.Box(-1.0, 1.0, (1,)) for name in ("temperature", "level", "action", "reward")})
+
+
+class Tank(gym.Env):
+    observation_space = TANK
+    action_space = gym.spaces.Box(-1.0, 1.0, (1,))
+
+    def reset(self, seed=None, options=None):
+        super().reset(seed=seed)
+        return self.observation_space.sample(), {}
+
+    def step(self, action):
+        return self.observation_space.sample(), 0.0, False, False, {}
+
+
+TANK_NAMES = ("obs[action][0]", "level", "reward[0]", "temperature")
+
+
+def test_a_key_of_one_number_is_its_name_but_for_those_of_other_variables():
+    assert found_names(Tank())[0] == TANK_NAMES
+    model = CausalGDP("MultiInputPolicy", Tank())
+    assert model.transition_variables.names[:5] == (*TANK_NAMES, "action[0]")
+    assert FlatSpace(TANK).names == TANK_NAMES
+
+
+def test_names_of_keys_are_found_in_other_processes():
+    venv = SubprocVecEnv([Tank])
+    assert found_names(venv) == (TANK_NAMES, None)
+    venv.close()
+    venv = SubprocVecEnv([lambda: Named(gym.make("Pendulum-v1"))])
+    assert found_names(venv) == (("a", "b", "c"), ("push",))
+    venv.close()
+
+
+def test_a_wrapper_that_makes_others_of_a_dictionary_s_numbers_hides_their_names():
+    class Sorted(gym.Wrapper):
+        def __init__(self, env):
+            super().__init__(env)
+            self.observation_space = gym.spaces.Box(-1.0, 1.0, (4,))
+
+    assert found_names(Sorted(Tank()))[0] is None
+
+
+def test_an_action_does_not_get_the_name_of_a_key():
+    class Same(Tank):
+        action_names = ("level",)
+
+    assert found_names(Same()) == (TANK_NAMES, None)
+
+
+@pytest.mark.parametrize("flat", [False, True])
+def test_a_point_maze_s_numbers_have_the_names_of_what_they_are(flat):
+    gym.register_envs(pytest.importorskip("gymnasium_robotics"))
+    env = gym.make("PointMaze_UMaze-v3")
+    wrapped = gym.wrappers.FlattenObservation(env) if flat else env
+    names, _ = found_names(wrapped)
+    observation, _ = wrapped.reset(seed=0)
+    values = dict(zip(names, observation if flat else gym.spaces.flatten(env.observation_space, observation), strict=True))
+    assert (values["x"], values["y"]) == (values["achieved x"], values["achieved y"])
+    assert [values["goal x"], values["goal y"]] == env.unwrapped.goal.tolist()
+    assert [values["vel x"], values["vel y"]] == env.unwrapped.point_env.data.qvel.tolist()
+
+
+def test_our_mazes_have_names():
+    assert found_names(gym.make("sb3_causalgdp/Maze2d-UMaze-v1")) == (("x", "y", "vel x", "vel y"), ("force x", "force y"))
+
+
+def test_a_graph_that_was_found_by_indices_is_a_graph_of_the_model_with_names(pendulum):
+    graph = pendulum.causal_graph()
+    by_index = replace(graph, variables=TransitionVariables(("obs[0]", "obs[1]", "obs[2]"), ("action[0]",)))
+    model = CausalGDP("MlpPolicy", "Pendulum-v1")
+    model.set_causal_graph(by_index)
+    assert model.causal_graph() == graph
+    with pytest.raises(ValueError, match="The graph is about"):
+        model.set_causal_graph(replace(graph, variables=TransitionVariables(("a", "b", "c"), ("d",))))
 
 
 @pytest.fixture(scope="module")

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.suite.jobs import ROOT, Job, run_in_process
+from sb3_causalgdp.hints import how_to_install
 
 
 class RayExecutor:
@@ -24,7 +25,7 @@ class RayExecutor:
         try:
             import ray
         except ImportError as error:
-            raise ImportError('running on a cluster needs Ray: pip install "sb3_causalgdp[cluster]"') from error
+            raise ImportError(f"running on a cluster needs Ray: {how_to_install('cluster')}") from error
         self._ray = ray
         self.folder = folder
         # The benchmarks are no part of the installed package: the machines get a copy of their code

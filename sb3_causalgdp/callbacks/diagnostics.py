@@ -2,13 +2,16 @@
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch as th
 from stable_baselines3.common.type_aliases import PyTorchObs
 
 from sb3_causalgdp.diffusion.guidance import guidance_shift
 from sb3_causalgdp.diffusion.samplers import bind
+from sb3_causalgdp.networks import q_values
 from sb3_causalgdp.policies import CausalGDPPolicy
+from sb3_causalgdp.prediction import act_in_torch, candidate_noise
 
 
 @th.no_grad()
@@ -36,6 +39,43 @@ def guidance_divergence(policy: CausalGDPPolicy, observations: PyTorchObs) -> fl
     :return: The divergence, at least 0; Theorem 1 bounds the change of the return by its square root
     """
     return float(step_divergences(policy, observations).sum(dim=0).mean())
+
+
+class Choice(NamedTuple):
+    """
+    What the critics say of a policy's deterministic actions, in the mean over a batch.
+
+    :param q_value: The smallest target Q of the actions
+    :param guidance_advantage: How much of it the guidance brings: less that of the best candidates before they are guided; 0
+        without guidance
+    :param candidate_spread: Standard deviation of an observation's candidates, for actions in [-1, 1]; 0 where there is one
+    """
+
+    q_value: float
+    guidance_advantage: float
+    candidate_spread: float
+
+
+@th.no_grad()
+def choice(policy: CausalGDPPolicy, observations: PyTorchObs) -> Choice:
+    """
+    :param policy: A policy in evaluation mode
+    :param observations: A batch of observations
+    :return: What the critics say of its actions; no random number is drawn
+    """
+    features, critic = policy.actor.features(observations), policy.critic_target
+    n_candidates, n_observations = policy.n_action_candidates, len(features)
+    noise = candidate_noise(policy, n_observations, deterministic=True)
+    candidates = policy.actor.sample(features.repeat_interleave(n_candidates, dim=0), noise)
+    critic_features = critic.extract_features(observations, critic.features_extractor)
+    repeated = critic_features.repeat_interleave(n_candidates, dim=0)
+    values = th.cat(q_values(critic, repeated, candidates), dim=1).amin(dim=1).view(-1, n_candidates)
+    unguided = values.amax(dim=1).mean()
+    spread = candidates.view(n_observations, n_candidates, -1).std(dim=1, correction=0).mean()
+    actions = act_in_torch(policy, observations, features, noise)
+    value = th.cat(q_values(critic, critic_features, actions), dim=1).amin(dim=1).mean()
+    advantage = float(value - unguided) if policy.is_guided else 0.0
+    return Choice(float(value), advantage, float(spread))
 
 
 @dataclass(frozen=True)

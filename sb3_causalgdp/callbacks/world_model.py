@@ -13,7 +13,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.type_aliases import PyTorchObs
 
-from sb3_causalgdp.callbacks.diagnostics import guidance_divergence, step_size_bound
+from sb3_causalgdp.callbacks.diagnostics import choice, guidance_divergence, step_size_bound
 from sb3_causalgdp.causal import min_rows
 from sb3_causalgdp.causal.description import count_of_edges
 
@@ -182,10 +182,10 @@ class CausalWorldModelCallback(BaseCallback):
             return policy.exact_causal_state({key: rows(values) for key, values in observations.items()}).cpu().numpy()
         return policy.exact_causal_state(rows(observations)).cpu().numpy()
 
-    def _draw_observations(self, buffer: ReplayBuffer) -> PyTorchObs:
+    def _draw_observations(self, buffer: ReplayBuffer, generator: Any) -> PyTorchObs:
         """A batch as the policy sees it, straight from the arrays: a HER buffer cannot sample before an episode has ended."""
-        rows = np.random.randint(buffer.size(), size=self.diagnostics_batch_size)
-        envs = np.random.randint(buffer.n_envs, size=self.diagnostics_batch_size)
+        rows = generator.randint(buffer.size(), size=self.diagnostics_batch_size)
+        envs = generator.randint(buffer.n_envs, size=self.diagnostics_batch_size)
         drawn: np.ndarray | dict[str, np.ndarray]
         if isinstance(buffer.observations, dict):
             drawn = {key: values[rows, envs] for key, values in buffer.observations.items()}
@@ -198,14 +198,22 @@ class CausalWorldModelCallback(BaseCallback):
 
     def _log_diagnostics(self) -> None:
         model = self.model
-        if self.diagnostics_batch_size == 0 or not model.policy.is_guided:
+        if self.diagnostics_batch_size == 0:
             return
         buffer = model.replay_buffer if model.replay_buffer.size() > 0 else model.offline_buffer
         if buffer is None:
             # A loaded model starts with an empty buffer
             return
-        observations = self._draw_observations(buffer)
+        # An unguided training draws no more random numbers than one without diagnostics
+        observations = self._draw_observations(buffer, np.random if model.policy.is_guided else np.random.RandomState(0))
         model.policy.set_training_mode(False)
+        for name, value in choice(model.policy, observations)._asdict().items():
+            self.logger.record(f"policy/{name}", value)
+        if model.policy.is_guided:
+            self._log_guidance(observations)
+
+    def _log_guidance(self, observations: PyTorchObs) -> None:
+        model = self.model
         self.logger.record("guidance/kl", guidance_divergence(model.policy, observations))
         bound = step_size_bound(model.policy, observations)
         self.logger.record("guidance/step_size", bound.step_size)

@@ -52,6 +52,8 @@ def make_parser() -> argparse.ArgumentParser:
     table("--next-state", metavar="NAMES", help="columns of the next state (the state --lag rows later)")
     table("--lag", type=_positive, default=1, metavar="N", help="rows from a state to the next one (%(default)s)")
     table("--drop-missing", action="store_true", help="leave out transitions with a missing value")
+    add("--state-names", metavar="NAMES", help="of a source that is no table: what to call its states (obs[0], obs[1], ...)")
+    add("--action-names", metavar="NAMES", help="the same for its actions (action[0], ...)")
     add("--method", default="partial_r2", help=f"discovery method, one of {', '.join(METHODS)} (%(default)s)")
     add(
         "--method-kwargs", nargs="+", default=[], metavar="KEY=VALUE", help="arguments of the method, or a JSON object of them"
@@ -200,7 +202,9 @@ def _open(arguments: argparse.Namespace) -> "tuple[TransitionSource, tuple[str, 
         source = open_source(
             arguments.source, download=arguments.download, max_rows=arguments.max_rows, trusted=arguments.trusted
         )
-        return source, ()
+        return _renamed(source, arguments), ()
+    if arguments.state_names is not None or arguments.action_names is not None:
+        raise ValueError("the names of a table are those of its columns: --state-names and --action-names are for others")
     from sb3_causalgdp.causal.transitions import TableSource
     from sb3_causalgdp.sources.columns import read_columns
     from sb3_causalgdp.sources.tables import Table
@@ -222,6 +226,17 @@ def _open(arguments: argparse.Namespace) -> "tuple[TransitionSource, tuple[str, 
         name=str(path),
     )
     return TableSource(table, arguments.max_rows), table.remarks
+
+
+def _renamed(source: "TransitionSource", arguments: argparse.Namespace) -> "TransitionSource":
+    for option, argument in (("--state-names", "state_names"), ("--action-names", "action_names")):
+        given = getattr(arguments, argument)
+        if given is not None:
+            own = getattr(source.variables, argument)
+            if len(_names(given)) != len(own):
+                raise ValueError(f"{option} must be {len(own)} names for {', '.join(own)}, got {given!r}")
+            source.variables = replace(source.variables, **{argument: tuple(_names(given))})
+    return source
 
 
 def _names(text: str) -> list[str]:

@@ -3,10 +3,12 @@
 from collections.abc import Callable, Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
+from sb3_causalgdp.hints import how_to_install
+
 if TYPE_CHECKING:
     import pandas as pd
 
-PLOTS_HINT = 'matplotlib and networkx are needed for this: pip install "sb3_causalgdp[plots]"'
+PLOTS_HINT = f"matplotlib and networkx are needed for this: {how_to_install('plots')}"
 
 
 def picture(name: str) -> Callable[..., Any]:

@@ -13,10 +13,20 @@ from gymnasium import spaces
 
 from sb3_causalgdp.causal.transitions import BATCH_ROWS, SourceError, TransitionSource
 from sb3_causalgdp.causal.variables import TransitionVariables
-from sb3_causalgdp.saving.archives import errors_of, existing, is_zip, load_minari, one_line, read_arrays, read_pickle
+from sb3_causalgdp.hints import how_to_install, how_to_make
+from sb3_causalgdp.saving.archives import (
+    DownloadError,
+    errors_of,
+    existing,
+    is_zip,
+    load_minari,
+    one_line,
+    read_arrays,
+    read_pickle,
+)
 from sb3_causalgdp.saving.plain import SPACES, Known, decoded, read_json
 
-OFFLINE_HINT = 'pip install "sb3_causalgdp[offline]"'
+OFFLINE_HINT = how_to_install("offline")
 MINARI_ID = re.compile(r"[-\w]+(/[-\w]+)*-v\d+")
 ARRAYS = ("observations", "actions", "next_observations", "rewards")
 BUFFER_ATTRIBUTES = (
@@ -24,6 +34,7 @@ BUFFER_ATTRIBUTES = (
     *("optimize_memory_usage", "observation_space", "action_space"),
 )
 SUFFIXES = (".npz", ".pkl")
+RESERVED = ("action", "reward")  # names of other variables
 
 __all__ = [
     "BATCH_ROWS",
@@ -41,7 +52,8 @@ class FlatSpace:
     """
     The numbers of an observation space in the order of gymnasium's ``flatten``, for many observations at once.
 
-    Names are ``obs[i]``, for dictionaries ``key[i]`` and ``outer.inner[i]``; discrete parts are one-hot.
+    Names are ``obs[i]``, for dictionaries ``key[i]`` and ``outer.inner[i]``, without the index where a key has one number;
+    discrete parts are one-hot.
 
     :param space: Observation space, may be nested
     :raises SourceError: when a part of it is an image, or has no fixed number of numbers
@@ -56,7 +68,8 @@ class FlatSpace:
                 # "action[0]" would be the name of an action as well
                 name = f"obs[{name}]" if name else "obs"
             _check_leaf(name, leaf)
-            names += [f"{name}[{index}]" for index in range(spaces.flatdim(leaf))]
+            one = spaces.flatdim(leaf) == 1 and isinstance(path[0] if path else 0, str) and name not in RESERVED
+            names += [name] if one and not name.startswith("obs[") else [f"{name}[{i}]" for i in range(spaces.flatdim(leaf))]
         self.names = tuple(names)
 
     def __call__(self, observations: Any) -> np.ndarray:
@@ -347,8 +360,15 @@ def _open_minari(dataset_id: str, download: bool, max_rows: int | None, trusted:
     try:
         dataset = load_minari(dataset_id, download, trusted)
     except FileNotFoundError as error:
-        raise SourceError(f"no Minari dataset {dataset_id!r} on this machine: ask for its download (--download)") from error
-    except Exception as error:  # of the network, of a server's library, or of a broken file
+        raise SourceError(
+            f"no Minari dataset {dataset_id!r} on this machine: ask for its download (--download); {how_to_make(dataset_id)}"
+        ) from error
+    except DownloadError as error:
+        raise SourceError(
+            f"the Minari dataset {dataset_id!r} is not on this machine and cannot be downloaded ({error}): "
+            f"{how_to_make(dataset_id)}"
+        ) from None
+    except Exception as error:  # of a broken file
         raise SourceError(f"the Minari dataset {dataset_id!r} cannot be loaded: {one_line(error)}") from error
     try:
         return MinariSource(dataset, dataset_id, max_rows)

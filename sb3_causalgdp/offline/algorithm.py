@@ -14,7 +14,7 @@ import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.base_class import maybe_make_env
 from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
-from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback, ProgressBarCallback
+from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback
 from stable_baselines3.common.noise import ActionNoise, VectorizedActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
@@ -24,8 +24,9 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_no
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from sb3_causalgdp.files import saved_when_done
+from sb3_causalgdp.offline.callbacks import TrainingBar, note_success
 from sb3_causalgdp.offline.loaded_buffers import check_loaded_buffer, in_columns
-from sb3_causalgdp.offline.observations import flat_space, flattened_space, layout_name, same_layout
+from sb3_causalgdp.offline.observations import flat_space, flattened_space, key_names, layout_name, same_layout
 from sb3_causalgdp.offline.preload import (
     check_buffer,
     copy_rows,
@@ -132,7 +133,7 @@ class OfflineToOnlineAlgorithm(OffPolicyAlgorithm):
         learns online after ``set_env``. Dictionaries of observations are flattened, except for a ``MultiInputPolicy``.
 
         Arrays and tables do not tell their spaces. What is not given is inferred, with a warning that says what: observations
-        of any numbers, and actions between the smallest and the largest.
+        of any numbers, and actions between the smallest and the largest. The names of the columns are those of the variables.
 
         :param source: As for :meth:`preload`; only its spaces are read
         :param policy: The policy model to use
@@ -145,12 +146,14 @@ class OfflineToOnlineAlgorithm(OffPolicyAlgorithm):
         """
         if "states" in kwargs and not isinstance(source, Table):
             source = Table(source, **{name: kwargs.pop(name) for name in signature(Table).parameters if name in kwargs})
-        observation_space, action_space = spaces_of(open_source(source), observation_space, action_space)
+        opened = open_source(source)
+        observation_space, action_space = spaces_of(opened, observation_space, action_space)
         layout = observation_space
+        names = opened.state_names or key_names(layout), opened.action_names
         policy_class = cls.policy_aliases.get(policy) if isinstance(policy, str) else policy
         if not (policy_class is not None and issubclass(policy_class, cls.policy_aliases["MultiInputPolicy"])):
             layout, observation_space = observation_space, flat_space(observation_space)
-        model = cls(policy, SpacesEnv(observation_space, action_space, n_envs), **kwargs)
+        model = cls(policy, SpacesEnv(observation_space, action_space, n_envs, *names), **kwargs)
         model.env, model.observation_layout = None, layout if layout is not observation_space else None
         return model
 
@@ -172,6 +175,25 @@ class OfflineToOnlineAlgorithm(OffPolicyAlgorithm):
         self.observation_layout = layout
         if normalizer is not None and self.offline_buffer is not None:
             prime_normalizer(normalizer, self.offline_buffer, (0, self.offline_buffer.size()), self._offline_marks)
+
+    def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
+        return super()._init_callback([*callback_list(callback), TrainingBar()] if progress_bar else callback)
+
+    def progress_parts(self) -> list[str]:
+        """
+        :return: What the progress bar says, the most important first: mean return and success rate of the last episodes
+        """
+        if self.is_pretraining:
+            return ["gradient steps"]
+        returns = [episode["r"] for episode in self.ep_info_buffer or ()]
+        parts = [f"return {np.mean(returns):.4g}" if returns else "no episode yet"]
+        return [*parts, f"success {np.mean(self.ep_success_buffer):.0%}"] if self.ep_success_buffer else parts
+
+    def _update_info_buffer(self, infos: list[dict[str, Any]], dones: np.ndarray | None = None) -> None:
+        if dones is not None and dones.any():
+            for info in infos:
+                note_success(info)
+        super()._update_info_buffer(infos, dones)
 
     def _checked_layout(self, env: GymEnv) -> spaces.Space | None:
         """What the observations of an environment are flattened from, by key; the model's own where that cannot be told."""
@@ -342,7 +364,7 @@ class OfflineToOnlineAlgorithm(OffPolicyAlgorithm):
         if not self._custom_logger:
             self._logger = configure_logger(self.verbose, self.tensorboard_log, tb_log_name, self._n_pretrain_steps == 0)
         with self._pretraining_clock(gradient_steps) as total_timesteps:
-            callback = self._init_callback([*callback_list(callback), *([_GradientStepsBar()] if progress_bar else [])])
+            callback = self._init_callback(callback_list(callback), progress_bar)
             # No episode ends here, and there are no infos: callbacks that ask for them find none
             without_steps = {"dones": np.zeros(self.n_envs, dtype=bool), "infos": [{} for _ in range(self.n_envs)]}
             callback.on_training_start({**locals(), **without_steps}, globals())
@@ -589,11 +611,3 @@ class OfflineToOnlineAlgorithm(OffPolicyAlgorithm):
 
 def _normalised(parts: list[str]) -> str:
     return f"observations with {parts} normalised" if parts else "raw observations"
-
-
-class _GradientStepsBar(ProgressBarCallback):
-    """One step for each call, whatever the number of environments."""
-
-    def _on_step(self) -> bool:
-        self.pbar.update(1)
-        return True

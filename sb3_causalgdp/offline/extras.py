@@ -3,7 +3,9 @@
 import importlib
 from typing import Any
 
-OFFLINE_HINT = 'pip install "sb3_causalgdp[offline]"'
+from sb3_causalgdp.hints import how_to_install
+
+OFFLINE_HINT = how_to_install("offline")
 
 
 def need(module: str) -> Any:

@@ -245,6 +245,8 @@ class Maze2dEnv(gym.Env[np.ndarray, np.ndarray], EzPickle):
         self.render_mode = render_mode
         self.simulator = PointSimulator(self.maze)
         self.observation_space = gym.spaces.Box(-np.inf, np.inf, (4,), np.float64)
+        self.state_names = ("x", "y", "vel x", "vel y")
+        self.action_names = ("force x", "force y")
         self.action_space = gym.spaces.Box(-1.0, 1.0, (2,), np.float32)
         self._renderer: Any = None
 

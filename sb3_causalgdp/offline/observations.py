@@ -1,7 +1,7 @@
 """From a dataset's observations to a model's: the same flattening and the same image layout as its environment's wrappers."""
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -12,6 +12,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 ObservationMap = Callable[[Any], Any]
 Path = tuple[str | int, ...]
+OTHER_VARIABLES = ("action", "reward")
 
 
 def flattened_space(env: gym.Env | VecEnv | None, parts: spaces.Space | None = None) -> spaces.Space | None:
@@ -222,6 +223,38 @@ def flat_space(space: spaces.Space) -> spaces.Space:
     :return: What ``FlattenObservation`` makes of dictionaries and tuples; others stay as they are
     """
     return spaces.flatten_space(space) if isinstance(space, spaces.Dict | spaces.Tuple) else space
+
+
+def key_names(space: spaces.Space, known: Mapping[str, Sequence[str]] | None = None) -> tuple[str, ...] | None:
+    """
+    :param space: Of observations
+    :param known: Names of the components of some keys
+    :return: A name for each component of a dictionary, in the order in which it is flattened: ``key``, and ``key[i]`` where it
+        has several; None for what is no dictionary of vectors
+    """
+    if not isinstance(space, spaces.Dict):
+        return None
+    names: list[str] = []
+    for key, part in space.spaces.items():
+        if isinstance(part, spaces.Dict):
+            inner = key_names(part)
+            if inner is None:
+                return None
+            names += [f"{key}.{name}" for name in inner]
+            continue
+        if not part.is_np_flattenable or len(part.shape or ()) > 2:
+            return None
+        size = spaces.flatdim(part)
+        own = tuple((known or {}).get(key, ()))
+        names += own if len(own) == size else _of_key(key, size)
+    return tuple(names)
+
+
+def _of_key(key: str, size: int) -> list[str]:
+    if size == 1 and key not in OTHER_VARIABLES:
+        return [key]
+    # "action[0]" would be the name of an action as well
+    return [f"{f'obs[{key}]' if key == 'action' else key}[{index}]" for index in range(size)]
 
 
 def shape_of_arrays(tree: Any) -> spaces.Space:

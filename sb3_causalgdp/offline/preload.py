@@ -12,6 +12,7 @@ from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
+from sb3_causalgdp.hints import how_to_install
 from sb3_causalgdp.offline.observations import ObservationMap, observation_map, shape_of_arrays
 from sb3_causalgdp.offline.rewards import RewardTransform, check_reward_transform, make_reward_transform
 from sb3_causalgdp.offline.sources import Chunk, Source
@@ -426,6 +427,6 @@ def _progress(source: Source, progress_bar: bool) -> Iterator[Any]:
     try:
         from tqdm import tqdm
     except ImportError as error:
-        raise ImportError('progress_bar=True needs tqdm: pip install "sb3_causalgdp[train]"') from error
+        raise ImportError(f"progress_bar=True needs tqdm: {how_to_install('train')}") from error
     with tqdm(total=source.n_transitions, desc=source.name, unit=" transitions", unit_scale=True) as bar:
         yield bar.update

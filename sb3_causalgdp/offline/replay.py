@@ -107,12 +107,22 @@ class SpacesEnv(VecEnv):
     :param observation_space: Observation space
     :param action_space: Action space
     :param num_envs: Number of environments
+    :param state_names: Names of the observation's components, None if they have none
+    :param action_names: Names of the action's components, None if they have none
     """
 
     MESSAGE = "There is no environment, only spaces: call model.set_env(env) first"
 
-    def __init__(self, observation_space: spaces.Space, action_space: spaces.Space, num_envs: int = 1) -> None:
+    def __init__(
+        self,
+        observation_space: spaces.Space,
+        action_space: spaces.Space,
+        num_envs: int = 1,
+        state_names: Sequence[str] | None = None,
+        action_names: Sequence[str] | None = None,
+    ) -> None:
         self.render_mode = None
+        self.names = {"state_names": state_names, "action_names": action_names}
         super().__init__(num_envs, observation_space, action_space)
 
     def reset(self):
@@ -130,6 +140,8 @@ class SpacesEnv(VecEnv):
     def get_attr(self, attr_name, indices=None):
         if attr_name == "render_mode":
             return [None] * self.num_envs
+        if self.names.get(attr_name) is not None:
+            return [self.names[attr_name]] * self.num_envs
         raise AttributeError(self.MESSAGE)
 
     def set_attr(self, attr_name, value, indices=None) -> None:

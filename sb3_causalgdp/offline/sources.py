@@ -11,10 +11,11 @@ import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
 
+from sb3_causalgdp.hints import how_to_make
 from sb3_causalgdp.offline.extras import OFFLINE_HINT
 from sb3_causalgdp.offline.rewards import RewardTransform, SavedRewards
 from sb3_causalgdp.offline.saved_buffers import SUFFIXES, is_buffer, read_buffer
-from sb3_causalgdp.saving.archives import errors_of, existing, load_minari, one_line, read_arrays
+from sb3_causalgdp.saving.archives import DownloadError, errors_of, existing, load_minari, one_line, read_arrays
 from sb3_causalgdp.sources.columns import SUFFIXES as TABLE_SUFFIXES
 from sb3_causalgdp.sources.columns import is_frame
 from sb3_causalgdp.sources.tables import Table
@@ -95,6 +96,10 @@ class Source:
     """Whether actions are in [-1, 1] already, as SB3's replay buffers store them."""
     layout: spaces.Space | None = None
     """What flat observations were flattened from, with its order of keys; None if it is not known."""
+    state_names: tuple[str, ...] | None = None
+    """Names of the components of an observation, where the source has them."""
+    action_names: tuple[str, ...] | None = None
+    """Names of the components of an action, where the source has them."""
     is_in_order = True
     """Whether a transition that does not end an episode is followed by the next one of that episode."""
 
@@ -293,6 +298,7 @@ class TableSource(ArraySource):
         none = np.zeros(len(table), dtype=bool)
         columns = {"observations": table.observations, "next_observations": table.next_observations}
         columns = {name: values.astype(np.float32) for name, values in columns.items()}
+        self.state_names, self.action_names = tuple(table.state_names), tuple(table.action_names)
         rest = {"actions": table.actions.astype(np.float32), "rewards": table.rewards}
         super().__init__({**columns, **rest, "terminations": none, "truncations": table.is_last}, table.name)
 
@@ -361,15 +367,20 @@ def _open_minari(dataset_id: str, download: bool, trusted: bool) -> Source:
         raise ImportError(f"The Minari dataset {dataset_id!r} needs the package minari: {OFFLINE_HINT}") from error
     try:
         dataset = load_minari(dataset_id, download, trusted)
-    except FileNotFoundError as error:
-        raise FileNotFoundError(f"The Minari dataset {dataset_id!r} is not on this machine: {error}") from error
+    # The hub's libraries raise long chains, of which the last line says all
+    except FileNotFoundError:
+        raise FileNotFoundError(
+            f"The Minari dataset {dataset_id!r} is not on this machine: {how_to_make(dataset_id)}"
+        ) from None
+    except DownloadError as error:
+        raise ValueError(
+            f"The Minari dataset {dataset_id!r} is not on this machine and cannot be downloaded ({error}): "
+            f"{how_to_make(dataset_id)}"
+        ) from None
     except ImportError as error:
         raise ImportError(f"The Minari dataset {dataset_id!r} needs another package ({error}): {OFFLINE_HINT}") from error
-    except Exception as error:  # of the network, of a server's library, or of a broken file
-        raise ValueError(
-            f"The Minari dataset {dataset_id!r} is not on this machine and cannot be downloaded, or its metadata are "
-            f"damaged: {one_line(error)}"
-        ) from error
+    except Exception as error:  # of a broken file
+        raise ValueError(f"The metadata of the Minari dataset {dataset_id!r} are damaged: {one_line(error)}") from error
     with errors_of(dataset_id):
         return MinariSource(dataset)
 

@@ -80,6 +80,10 @@ class FileError(ValueError):
     """What is wrong with a file, in one line that names it."""
 
 
+class DownloadError(ValueError):
+    """A dataset is not on this machine, and could not be brought there."""
+
+
 @contextmanager
 def errors_of(path: Any, what: str = "cannot be read") -> Iterator[None]:
     """
@@ -281,6 +285,7 @@ def load_minari(dataset_id: str, download: bool, trusted: bool = False) -> Any:
     :param trusted: Whether Minari may make the environment that its metadata describe, which runs what they name
     :return: The ``minari.MinariDataset``
     :raises ImportError: Without minari
+    :raises DownloadError: If it cannot be downloaded
     :raises ValueError: If its metadata are out of proportion, or name an environment in place of spaces
     """
     import minari
@@ -288,7 +293,12 @@ def load_minari(dataset_id: str, download: bool, trusted: bool = False) -> Any:
 
     path = get_dataset_path(dataset_id) / "data" / "metadata.json"
     if download and not path.parent.exists():
-        hosting.download_dataset(dataset_id)
+        try:
+            hosting.download_dataset(dataset_id)
+        except ImportError:
+            raise
+        except Exception as error:  # of the network, or of a server's library
+            raise DownloadError(one_line(error)) from error
     if path.is_file():
         with errors_of(dataset_id):
             metadata = json.loads(path.read_text(encoding="utf-8"))

@@ -15,7 +15,7 @@ import gymnasium as gym
 from sb3_causalgdp import TrainingDivergedError
 from sb3_causalgdp.offline.registration import register_environments
 from sb3_causalgdp.saving.archives import FileError
-from sb3_causalgdp.zoo.registration import TRUST_OPTION, ZOO_HINT, SetupError, register
+from sb3_causalgdp.zoo.registration import ALGORITHM, TRUST_OPTION, ZOO_HINT, SetupError, register
 from sb3_causalgdp.zoo.scripts import surroundings
 
 PROGRAM = "causalgdp-zoo"
@@ -34,6 +34,8 @@ SCRIPTS = {
 }
 PLOTS = ("all_plots", "plot_from_file", "plot_train")
 PLAYING = ("enjoy", "record_video")
+# RL Zoo's defaults for these are PPO and CartPole
+OF_ONE_ENVIRONMENT = ("train", "enjoy", "record_video", "record_training")
 # Whatever fails in these is about the network, or about what lies on the hub
 HUB_PACKAGES = ("huggingface_hub", "huggingface_sb3")
 
@@ -55,6 +57,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     trusted = TRUST_OPTION in arguments
     if script != "report":
         arguments = [one for one in arguments if one != TRUST_OPTION]
+    if script in OF_ONE_ENVIRONMENT:
+        arguments = _with_algorithm(script, arguments)
     before, sys.argv = sys.argv, [f"{PROGRAM} {script}", *arguments]
     try:
         _prepare(script, arguments, trusted)
@@ -68,6 +72,20 @@ def main(argv: Sequence[str] | None = None) -> None:
         _fail(f"{PROGRAM} {script}", _one_line(error, arguments))
     finally:
         sys.argv = before
+
+
+def _with_algorithm(script: str, arguments: list[str]) -> list[str]:
+    """CausalGDP unless they name another; they have to name the environment."""
+    parser = argparse.ArgumentParser(add_help=False, exit_on_error=False)
+    parser.add_argument("-h", "--help", action="store_true")
+    parser.add_argument("--algo", nargs="?", const="")
+    parser.add_argument("--env", nargs="?", const="")
+    given = parser.parse_known_args(arguments)[0]
+    if given.help:
+        return arguments
+    if given.env is None:
+        _fail(f"{PROGRAM} {script}", f"--env is needed, the id of an environment: {PROGRAM} {script} --env Pendulum-v1")
+    return ["--algo", ALGORITHM, *arguments] if given.algo is None else arguments
 
 
 def _usage() -> str:

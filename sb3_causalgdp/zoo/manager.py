@@ -81,12 +81,19 @@ class CausalGDPExperimentManager(ExperimentManager):
             # The task's environment is the right one, under another name
             warnings.filterwarnings("ignore", message=f"{task.dataset} was collected in")
         try:
-            return super().setup_experiment()
+            experiment = super().setup_experiment()
         except Exception as error:
-            if self._made_folder:
-                # An empty run would be the latest one, which the other scripts look for
-                shutil.rmtree(self.save_path, ignore_errors=True)
+            self._remove_empty_run()
             raise SetupError(f"{self.algo} on {self.env_name.gym_id}: {_message(error)}") from error
+        if experiment is None:
+            # A search: its results are in the storage and in a report
+            self._remove_empty_run()
+        return experiment
+
+    def _remove_empty_run(self) -> None:
+        """It would be the latest one, which the other scripts look for."""
+        if self._made_folder:
+            shutil.rmtree(self.save_path, ignore_errors=True)
 
     def create_log_folder(self) -> None:
         if self._manifest is not None:

@@ -5,10 +5,11 @@ import sys
 from typing import Any
 
 from sb3_causalgdp import CausalGDP
+from sb3_causalgdp.hints import how_to_install
 from sb3_causalgdp.zoo.offline_tasks import register_offline_tasks
 
 ALGORITHM = "causalgdp"
-ZOO_HINT = 'pip install "sb3_causalgdp[zoo]"'
+ZOO_HINT = how_to_install("zoo")
 TRUST_OPTION = "--trusted"
 
 

@@ -17,6 +17,7 @@ from sb3_causalgdp.callbacks.diagnostics import step_divergences
 from sb3_causalgdp.callbacks.pictures import draw_transitions, plot_guidance_strength, policy_input
 from sb3_causalgdp.causal import CausalGraph
 from sb3_causalgdp.causal.description import count_of_edges
+from sb3_causalgdp.causal.edges import GraphDiff
 from sb3_causalgdp.causal.plots import plot_causal_graph, plot_history
 from sb3_causalgdp.offline.saved_buffers import SUFFIXES, read_buffer
 from sb3_causalgdp.saving.archives import existing
@@ -27,6 +28,7 @@ from sb3_causalgdp.zoo.versions import installed_versions
 OBSERVATIONS = 2_000  # on which the effects of the actions are averaged
 GUIDANCE_OBSERVATIONS = 256
 MOST_EDGES = 20
+MOST_CHANGES = 12  # that are shown at once
 DPI = 144
 NO_TRANSITIONS = (
     "Not computed: there are no observations. Train with --save-replay-buffer, or let the model play (--episodes)."
@@ -56,13 +58,21 @@ class Table:
 
 
 @dataclass(frozen=True)
+class Text:
+    """Preformatted lines; those with a title are folded, and open with a click on it."""
+
+    lines: str
+    title: str = ""
+
+
+@dataclass(frozen=True)
 class Section:
     """A part of the page: remarks, then pictures, preformatted texts and tables."""
 
     title: str
     remarks: Sequence[str] = ()
     pictures: Sequence[Picture] = ()
-    texts: Sequence[str] = ()
+    texts: Sequence[Text] = ()
     tables: Sequence[Table] = ()
 
     @property
@@ -178,12 +188,17 @@ def _summary_section(run: RunFolder, model: CausalGDP, kind: str, model_path: Pa
     if evaluations is not None:
         means = evaluations.returns.mean(axis=1)
         best = int(means.argmax())
-        rows.append(("Last evaluation", f"{_spread(evaluations.returns[-1])} at {evaluations.steps[-1]:,} steps"))
-        rows.append(("Best evaluation", f"{_spread(evaluations.returns[best])} at {evaluations.steps[best]:,} steps"))
+        rows += [("Last evaluation", _evaluation(evaluations, -1)), ("Best evaluation", _evaluation(evaluations, best))]
     if model._causal_graph is not None:
         graph = model.causal_graph()
         rows.append(("Causal graph", f"{count_of_edges(graph)}, from {graph.n_samples:,} transitions"))
     return Section("Summary", run.problems_with(".zip"), tables=[Table((), rows)])
+
+
+def _evaluation(evaluations: Evaluations, index: int) -> str:
+    text = f"{_spread(evaluations.returns[index])} at {evaluations.steps[index]:,} steps"
+    rates = evaluations.success_rates
+    return text if rates is None else f"{text}, success rate {rates[index]:.0%}"
 
 
 def _learning_section(run: RunFolder) -> Section:
@@ -302,8 +317,13 @@ def _history_section(run: RunFolder, model: CausalGDP) -> Section:
             *run.problems_with(".zip"),
         ],
         [_picture(plot_history(graphs), caption)],
-        [str(last.diff(first))],
+        [_changes(last.diff(first))],
     )
+
+
+def _changes(changes: GraphDiff) -> Text:
+    counts = [f"{len(edges)} {name}" for name, edges in changes._asdict().items() if edges]
+    return Text(str(changes), f"Edges: {', '.join(counts)}" if sum(map(len, changes)) > MOST_CHANGES else "")
 
 
 def _effects_section(run: RunFolder, model: CausalGDP, transitions: Transitions | None) -> Section:
@@ -394,7 +414,7 @@ def _version_section(run: RunFolder, model_path: Path) -> Section:
 def _command_section(run: RunFolder) -> Section:
     if run.command is None:
         return Section("Command", ["Not recorded: the run has no command.txt."])
-    return Section("Command", texts=[run.command])
+    return Section("Command", texts=[Text(run.command)])
 
 
 # Text and pictures ------------------------------------------------------------------------------------------------------

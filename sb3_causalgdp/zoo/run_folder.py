@@ -43,10 +43,12 @@ class Evaluations:
     """
     :param steps: When it was evaluated, shape ``(m,)``
     :param returns: Of each episode, shape ``(m, n_episodes)``
+    :param success_rates: Of each evaluation, shape ``(m,)``; None where the environment does not tell success
     """
 
     steps: np.ndarray
     returns: np.ndarray
+    success_rates: np.ndarray | None = None
 
 
 class RunFolder:
@@ -203,11 +205,15 @@ class RunFolder:
         if not path.is_file():
             return None
         try:
-            arrays = read_arrays(path, ("timesteps", "results"))
+            arrays = read_arrays(path, ("timesteps", "results", "successes"))
             steps, returns = np.asarray(arrays["timesteps"], float), np.asarray(arrays["results"], float)
             if not (steps.ndim == 1 and returns.ndim == 2 and len(steps) == len(returns) and returns.size > 0):
                 raise ValueError(f"evaluations of shapes {steps.shape} and {returns.shape}")
-            return Evaluations(steps.astype(np.int64), returns)
+            successes = np.asarray(arrays["successes"], float) if "successes" in arrays else None
+            if successes is not None and (successes.ndim != 2 or len(successes) != len(steps) or successes.size == 0):
+                raise ValueError(f"evaluations of shapes {steps.shape}, and successes of {successes.shape}")
+            rates = None if successes is None else successes.mean(axis=1)
+            return Evaluations(steps.astype(np.int64), returns, rates)
         except Exception as error:  # a damaged file can raise anything
             self.note(path.relative_to(self.path).as_posix(), error)
             return None
@@ -246,17 +252,19 @@ def find_runs(folder: Path, trusted: bool = False) -> list[RunFolder]:
     """
     :param folder: The folder of a run, or of an algorithm, which holds those of runs
     :param trusted: Whether their files may bring Python objects that could run code
-    :return: The run; or of each environment the run with the largest number. Empty if there is none
+    :return: The run; or of each environment the run with the largest number, of those that have a model if there are any.
+        Empty if there is none
     """
     if _is_run(folder):
         return [RunFolder(folder, trusted)]
-    latest: dict[str, tuple[int, float, Path]] = {}
+    latest: dict[str, tuple[bool, int, float, Path]] = {}
     for path in folder.iterdir() if folder.is_dir() else ():
         name = RUN_NAME.fullmatch(path.name)
         if name is not None and _is_run(path):
-            candidate = (int(name["number"]), path.stat().st_mtime, path)
+            has_model = next(path.glob("*.zip"), None) is not None
+            candidate = (has_model, int(name["number"]), path.stat().st_mtime, path)
             latest[name["environment"]] = max(candidate, latest.get(name["environment"], candidate))
-    return [RunFolder(path, trusted) for _, (_, _, path) in sorted(latest.items())]
+    return [RunFolder(path, trusted) for _, (*_, path) in sorted(latest.items())]
 
 
 def _is_run(folder: Path) -> bool:

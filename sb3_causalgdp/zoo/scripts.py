@@ -11,11 +11,17 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
+
+from sb3_causalgdp.offline.callbacks import note_success
 from sb3_causalgdp.saving.archives import errors_of, read_pickle
 from sb3_causalgdp.zoo.registration import ALGORITHM, ZOO_HINT
 from sb3_causalgdp.zoo.settings import safe_files, whole_files
 
 MODULE = "sb3_causalgdp.zoo"
+# On a card for people who may not have it yet: the folder of the source, and what the zoo needs
+INSTALL_SOURCE = 'pip install "./sb3_causalgdp[zoo]"'
 
 
 @contextmanager
@@ -92,7 +98,7 @@ def own_model_card() -> Iterator[None]:
         card = Path(local_path)
         text = card.read_text(encoding="utf-8")
         if f"--algo {ALGORITHM} " in text:
-            text = text.replace("python -m rl_zoo3.", f"python -m {MODULE} ").replace("pip install rl_zoo3", ZOO_HINT)
+            text = text.replace("python -m rl_zoo3.", f"python -m {MODULE} ").replace("pip install rl_zoo3", INSTALL_SOURCE)
             card.write_text(text, encoding="utf-8")
         save(local_path, data)
 
@@ -152,11 +158,56 @@ def plain_results() -> Iterator[None]:
         yield
 
 
+@contextmanager
+def own_title() -> Iterator[None]:
+    """RL Zoo's bars of the last evaluations are called "PyBullet envs", whatever the environments are."""
+    import matplotlib.pyplot as plt
+
+    title = plt.title
+
+    def title_ours(label: str, *args: Any, **kwargs: Any) -> Any:
+        return title("Last evaluations" if label == "PyBullet envs" else label, *args, **kwargs)
+
+    with replaced(plt, "title", title_ours):
+        yield
+
+
+class SuccessVecEnv(VecEnvWrapper):
+    """
+    Environments that say ``is_success``, as SB3 does, where they say ``success``.
+
+    :param venv: The environments
+    """
+
+    def reset(self) -> VecEnvObs:
+        return self.venv.reset()
+
+    def step_wait(self) -> VecEnvStepReturn:
+        observations, rewards, dones, infos = self.venv.step_wait()
+        for info in infos:
+            note_success(info)
+        return observations, rewards, dones, infos
+
+
+@contextmanager
+def told_success() -> Iterator[None]:
+    """``enjoy`` prints the success rate of more environments."""
+    import rl_zoo3
+
+    create = rl_zoo3.create_test_env
+
+    def create_ours(*args: Any, **kwargs: Any) -> VecEnv:
+        return SuccessVecEnv(create(*args, **kwargs))
+
+    with replaced(rl_zoo3, "create_test_env", create_ours):
+        yield
+
+
 SURROUNDINGS: dict[str, list[Callable[[], Any]]] = {
     "benchmark": [own_commands, optional_hub_files, safe_files],
-    "enjoy": [optional_hub_files, safe_files],
+    "enjoy": [optional_hub_files, safe_files, told_success],
     "load_from_hub": [optional_hub_files],
-    "plot_from_file": [plain_results],
+    "plot_from_file": [plain_results, own_title],
     "push_to_hub": [safe_files, model_card_metadata, own_model_card, ffmpeg_on_path],
     "record_video": [safe_files],
     "record_training": [own_commands, ffmpeg_on_path],

@@ -258,6 +258,9 @@ TAGS = {
     "guidance/lipschitz",
     "guidance/step_size",
     "guidance/step_size_bound",
+    "policy/candidate_spread",
+    "policy/guidance_advantage",
+    "policy/q_value",
     "train/actor_loss",
     "train/bound_loss",
     "train/critic_loss",
@@ -293,7 +296,7 @@ def test_diagnostics_can_be_left_out_and_a_refresh_can_be_printed(capsys):
     model = make()
     model.learn(64, callback=RecordingCallback(diagnostics_batch_size=0, verbose=1))
     names = set(model.logger.name_to_value)
-    assert "causal/n_edges" in names and not any(name.startswith("guidance/") for name in names)
+    assert "causal/n_edges" in names and not any(name.startswith(("guidance/", "policy/")) for name in names)
     assert "Causal graph at 60 steps: " in capsys.readouterr().out
 
 
@@ -302,6 +305,8 @@ def test_without_guidance_there_is_a_graph_and_no_diagnostics_of_guidance():
     model.learn(64, callback=RecordingCallback())
     assert model.causal_graph().num_timesteps == 60
     assert not any(name.startswith("guidance/") for name in model.logger.name_to_value)
+    assert model.logger.name_to_value["policy/guidance_advantage"] == 0.0
+    assert model.logger.name_to_value["policy/candidate_spread"] > 0.0
 
 
 def test_diagnostics_leave_the_networks_alone():
@@ -349,12 +354,33 @@ def test_a_callback_can_end_training_at_the_first_step(answer):
     assert model.num_timesteps <= 202
 
 
-def test_a_progress_bar(capsys):
+def test_a_progress_bar(capsys, monkeypatch):
     pytest.importorskip("tqdm")
     pytest.importorskip("rich")
     model = make()
     model.learn(64, callback=RecordingCallback(), progress_bar=True)
     assert model.causal_graph().num_timesteps == 60
+    assert "no episode yet" in capsys.readouterr().out
+    return_only, everything = (progress_of(model, columns, monkeypatch, capsys) for columns in (80, 140))
+    edges = f"{model.causal_graph().n_edges} edges"
+    assert "64/64" in return_only and "return -155" in return_only and edges not in return_only
+    assert "64/64" in everything and f"return -155, success 50%, {edges}, graph 12 steps old" in everything
+
+
+def progress_of(model, columns, monkeypatch, capsys):
+    monkeypatch.setenv("COLUMNS", str(columns))
+    model.ep_info_buffer.extend([{"r": -150.0}, {"r": -160.0}])
+    model.ep_success_buffer.extend([True, False])
+    model.learn(64, callback=RecordingCallback(), progress_bar=True, reset_num_timesteps=False)
+    return " ".join(capsys.readouterr().out.split())
+
+
+def test_the_progress_bar_asks_seldom(monkeypatch):
+    pytest.importorskip("rich")
+    calls = []
+    monkeypatch.setattr(CausalGDP, "progress_parts", lambda self: [str(calls.append(self.num_timesteps))])
+    make(learning_starts=1_000).learn(256, progress_bar=True)
+    assert calls == [0, 100, 200, 256]
 
 
 @pytest.mark.parametrize(("kwargs", "warned"), [({}, False), ({"guidance": "score", "guidance_scale": 1e4}, True)])

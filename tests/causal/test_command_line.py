@@ -157,7 +157,7 @@ def test_the_whole_way_from_a_trained_model(tmp_path, capsys):
         (spaces.MultiDiscrete([2, 3]), [f"obs[{i}]" for i in range(5)]),
         (
             spaces.Dict({"b": spaces.Dict({"d": BOX, "c": spaces.Discrete(2)}), "a": spaces.MultiBinary(1)}),
-            ["a[0]", "b.c[0]", "b.c[1]", "b.d[0]", "b.d[1]"],
+            ["a", "b.c[0]", "b.c[1]", "b.d[0]", "b.d[1]"],
         ),
         (spaces.Tuple([spaces.Dict({"a": BOX}), spaces.Box(0, 1, ())]), ["obs[0.a][0]", "obs[0.a][1]", "obs[1][0]"]),
     ],
@@ -235,7 +235,7 @@ def record(minari, dataset_id, env, n_episodes):
 def test_rows_of_a_minari_dataset(minari):
     _, expected = record(minari, "tests/nested-v0", NestedEnv(), 4)
     source = open_source("tests/nested-v0")
-    assert source.variables.state_names == ("arm.angle[0]", "arm.angle[1]", "goal[0]")
+    assert source.variables.state_names == ("arm.angle[0]", "arm.angle[1]", "goal")
     assert source.n_rows == len(expected) == 30
     np.testing.assert_array_equal(rows_of(source), expected)
 
@@ -253,11 +253,12 @@ def test_the_whole_way_from_a_minari_dataset(minari, capsys):
 
 def test_minari_dataset_that_is_not_there(minari, capsys):
     assert "no Minari dataset 'no/such-v0' on this machine" in error_of(capsys, "no/such-v0")
+    assert "datasets make --help` lists datasets" in error_of(capsys, "no/such-v0")
 
 
 def test_minari_is_not_installed(monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "minari", None)
-    assert 'pip install "sb3_causalgdp[offline]"' in error_of(capsys, "D4RL/door/human-v2")
+    assert 'pip install "minari[hdf5]" gymnasium-robotics' in error_of(capsys, "D4RL/door/human-v2")
 
 
 # The command ------------------------------------------------------------------------------------------------------------
@@ -430,6 +431,19 @@ def test_the_picture_takes_the_options_of_a_view(arrays, tmp_path, capsys):
     for option, message in (("colour=red", "unknown options ['colour'] of a picture"), ("kind=pie", "kind must be one of")):
         assert message in error_of(capsys, *command, option)
     assert "--plot-kwargs need --plot FILE" in error_of(capsys, arrays, "--plot-kwargs", "causes=2")
+
+
+def test_a_buffer_s_variables_get_names(tmp_path, capsys):
+    rng = np.random.default_rng(0)
+    arrays = {name: rng.normal(size=(400, 2)) for name in ("observations", "next_observations")}
+    np.savez(tmp_path / "rows.npz", **arrays, actions=rng.normal(size=(400, 1)), rewards=rng.normal(size=400))
+    options = ("--state-names", "level, heat", "--action-names=valve", "--json", str(tmp_path / "g.json"))
+    main([str(tmp_path / "rows.npz"), "--quiet", *options])
+    assert CausalGraph.load(tmp_path / "g.json").variables.names[:3] == ("level", "heat", "valve")
+    said = error_of(capsys, tmp_path / "rows.npz", "--state-names", "level")
+    assert said.endswith("--state-names must be 2 names for obs[0], obs[1], got 'level'")
+    said = error_of(capsys, tmp_path / "rows.npz", "--state", "a", "--action", "b", "--reward", "c", "--state-names", "level")
+    assert "the names of a table are those of its columns" in said
 
 
 def test_minari_datasets_that_are_damaged(minari, capsys):

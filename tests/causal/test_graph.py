@@ -311,7 +311,7 @@ def test_malformed_json_fields_are_value_errors(field, value):
 
 @pytest.mark.parametrize(
     ("library", "method", "message"),
-    [("networkx", "to_networkx", r'pip install "sb3_causalgdp\[plots\]"'), ("pandas", "to_dataframe", "pip install pandas")],
+    [("networkx", "to_networkx", r"pip install matplotlib networkx pandas"), ("pandas", "to_dataframe", "pip install pandas")],
 )
 def test_missing_library_says_what_to_install(monkeypatch, library, method, message):
     monkeypatch.setitem(sys.modules, library, None)

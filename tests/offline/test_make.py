@@ -167,7 +167,7 @@ def test_missing_extras_are_named(package, root, capsys, monkeypatch):
     with pytest.raises(SystemExit) as error:
         run("maze2d-umaze", "--steps", "20")
     assert error.value.code == 2
-    assert 'pip install "sb3_causalgdp[offline]"' in capsys.readouterr().err
+    assert 'pip install "minari[hdf5]" gymnasium-robotics' in capsys.readouterr().err
 
 
 def test_importing_the_package_imports_no_simulator():

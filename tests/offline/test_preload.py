@@ -509,6 +509,10 @@ def test_a_dataset_that_is_nowhere(tmp_path, monkeypatch):
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
     monkeypatch.setattr("minari.storage.hosting.download_dataset", fail)
     refuses(make(), "D4RL/pointmaze/umaze-v2", "'D4RL/pointmaze/umaze-v2' is not on this machine.*no network")
+    with pytest.raises(ValueError, match="datasets make maze2d-umaze` makes sb3_causalgdp") as error:
+        CausalGDP.from_dataset("D4RL/pointmaze/umaze-v2")
+    # Not the long chain of the hub's libraries
+    assert error.value.__suppress_context__ and "\n" not in str(error.value)
     with pytest.raises(FileNotFoundError, match="is not on this machine"):
         make().preload("D4RL/pointmaze/umaze-v2", download=False)
     refuses(make(), "no_such_file.npz", "no file 'no_such_file.npz'", FileNotFoundError)
@@ -523,7 +527,7 @@ def test_minari_is_not_installed(monkeypatch):
         return import_module(name, *args, **kwargs)
 
     monkeypatch.setattr(builtins, "__import__", without_minari)
-    refuses(make(), "D4RL/pointmaze/umaze-v2", r'pip install "sb3_causalgdp\[offline\]"', ImportError)
+    refuses(make(), "D4RL/pointmaze/umaze-v2", r'pip install "minari\[hdf5\]" gymnasium-robotics', ImportError)
 
 
 def test_missing_arrays_and_lengths_are_named(episodes):

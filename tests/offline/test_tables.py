@@ -39,6 +39,20 @@ def test_a_model_is_made_from_a_frame_and_learns_from_it():
     assert model.action_space.contains(action)
 
 
+def test_the_model_of_a_table_has_its_columns_names():
+    frame = make_frame()
+    with pytest.warns(UserWarning, match="spaces are inferred"):
+        model = make(frame, **ROLES)
+    assert model.transition_variables.names[:3] == ("level", "temperature", "valve")
+    model.preload(Table(frame, **ROLES))
+    model.pretrain(4)
+    outcome = model.intervene(np.zeros(2), [1.0], {"valve": 2.0})
+    assert set(outcome.to_dataframe()["outcome"]) == {"level'", "temperature'", "reward"}
+    with pytest.warns(UserWarning, match="spaces are inferred"):
+        model = make(frame, **ROLES, state_names=["a", "b"])
+    assert model.transition_variables.names[:3] == ("a", "b", "valve")
+
+
 def test_given_spaces_are_taken_without_a_word(recwarn):
     wanted = spaces.Box(-10.0, 10.0, (2,)), spaces.Box(0.0, 10.0, (1,))
     model = make(make_frame(), **ROLES, observation_space=wanted[0], action_space=wanted[1])

@@ -31,6 +31,23 @@ def test_usage_lists_the_scripts(capsys):
         assert all(f"  {script} " in output for script in command_line.SCRIPTS)
 
 
+@pytest.mark.parametrize("script", ["train", "enjoy", "record_video", "record_training"])
+def test_an_environment_has_to_be_named(script, fails, folder):
+    assert f"--env is needed, the id of an environment: causalgdp-zoo {script} --env Pendulum-v1" in fails(
+        script, "-f", "logs"
+    )
+    assert not list(folder.iterdir())
+
+
+def test_the_algorithm_is_ours_unless_another_is_named(zoo, fails, folder, capsys):
+    broken = ("train", "--env", "Pendulum-v1", "--env-kwargs", "gravty:3")
+    assert "causalgdp on Pendulum-v1: " in fails(*broken)
+    assert "sac on Pendulum-v1: " in fails(*broken, "--alg", "sac")
+    with pytest.raises(SystemExit) as raised:
+        zoo("train", "--help")
+    assert raised.value.code == 0 and "--n-timesteps" in capsys.readouterr().out
+
+
 def test_an_unknown_script(fails):
     assert "unknown script 'trian', it must be one of train, enjoy, " in fails("trian")
 
@@ -86,7 +103,9 @@ def test_a_plot_without_its_package(fails, monkeypatch):
     monkeypatch.setitem(sys.modules, "seaborn", None)
     for name in [name for name in sys.modules if name.startswith("rl_zoo3.plots")]:
         monkeypatch.delitem(sys.modules, name)
-    assert 'pip install "sb3_causalgdp[zoo]"' in fails("plot_train", "-a", "causalgdp", "-e", "Pendulum-v1", "-f", "logs")
+    assert 'pip install "rl-zoo3>=2.7" sb3-contrib' in fails(
+        "plot_train", "-a", "causalgdp", "-e", "Pendulum-v1", "-f", "logs"
+    )
 
 
 def test_the_traceback_is_shown_on_request(zoo, folder):
@@ -107,12 +126,10 @@ def test_errors_in_the_training_keep_their_traceback(zoo, folder, tiny, monkeypa
 
 def test_without_rl_zoo_the_command_says_how_to_install_it(folder):
     # A process in which the package is not there
-    code = (
-        "import sys; sys.modules['rl_zoo3'] = None; from sb3_causalgdp.zoo import main; main(['train', '--algo', 'causalgdp'])"
-    )
+    code = "import sys; sys.modules['rl_zoo3'] = None; from sb3_causalgdp.zoo import main; main(['train', '--env', 'A-v1'])"
     done = subprocess.run(
         [sys.executable, "-c", f"import sys; sys.path[:] = {sys.path!r}; {code}"], capture_output=True, text=True
     )
     assert done.returncode == 2
     assert done.stderr.strip().splitlines()[-1].startswith("causalgdp-zoo train: error: RL Zoo cannot be imported")
-    assert 'pip install "sb3_causalgdp[zoo]"' in done.stderr and "Traceback" not in done.stderr
+    assert 'pip install "rl-zoo3>=2.7" sb3-contrib' in done.stderr and "Traceback" not in done.stderr

@@ -118,14 +118,14 @@ def full_page(zoo, trained, tmp_path_factory):
     return page
 
 
-def add_history(path):
-    """An earlier graph that differs in one edge."""
+def add_history(path, n_edges=1):
+    """An earlier graph that differs in some edges."""
     from sb3_causalgdp import CausalGDP
 
     model = CausalGDP.load(path, device="cpu")
     graph = model.causal_graph()
     masks = graph.masks.copy()
-    masks[0, 0] = 1.0 - masks[0, 0].round()
+    masks.flat[:n_edges] = 1.0 - masks.flat[:n_edges].round()
     model.causal_graph_history = [replace(graph, masks=masks, num_timesteps=120), graph]
     model.save(path, include=["causal_graph_history"])
 
@@ -177,7 +177,7 @@ def test_it_says_what_the_run_was(full_page):
     assert "6 episodes" in summary and "from 239 transitions" in summary
     assert "Found after 240 environment steps by partial_r2 from 239 transitions" in full_page.text("Causal graph")
     assert "what changed from step 120 to step 240" in full_page.text("History of the graph")
-    assert "opened (1): obs[0] -> obs[0]'" in full_page.text("History of the graph")
+    assert "opened (1): cos angle -> cos angle'" in full_page.text("History of the graph")
     assert "300 transitions drawn from replay_buffer.pkl" in full_page.text("Effects of the actions")
     assert "Deterministic policy, 2 episodes" in full_page.text("Evaluation")
     hyperparameters = full_page.text("Hyperparameters")
@@ -211,6 +211,28 @@ def test_the_history_is_that_of_the_run_whichever_model_is_shown(zoo, run):
 def test_evaluations_stand_on_the_page(full_page, trained):
     results = np.load(trained / "evaluations.npz")["results"]
     assert f"{results[-1].mean():.1f} ± {results[-1].std():.1f} at 300 steps" in full_page.text("Summary")
+
+
+def test_many_changes_of_the_graph_are_folded(zoo, run):
+    add_history(run / "Pendulum-v1.zip", n_edges=13)
+    zoo("report", run, "--episodes", 0)
+    page = Page(run / "report.html")
+    history = page.source.split('id="history-of-the-graph"')[1].split("</section>")[0]
+    assert "<details><summary>Edges: " in history and history.count("<pre>") == 1
+    assert history.index("<details>") < history.index("<pre>") < history.index("</details>")
+
+
+def test_few_changes_of_the_graph_are_shown(full_page):
+    history = full_page.source.split('id="history-of-the-graph"')[1].split("</section>")[0]
+    assert "<details>" not in history and "opened (1)" in history
+
+
+def test_success_rates_stand_on_the_page(zoo, run):
+    with np.load(run / "evaluations.npz") as file:
+        evaluations = dict(file)
+    np.savez(run / "evaluations.npz", **evaluations, successes=[[True, False], [True, True]])
+    zoo("report", run, "--episodes", 0)
+    assert "at 300 steps, success rate 100%" in Page(run / "report.html").text("Summary")
 
 
 def test_of_several_runs_those_with_a_model_get_a_page(zoo, run, capsys):
@@ -364,6 +386,12 @@ def test_of_an_algorithms_folder_the_latest_run_of_each_environment(run):
         (folder / name).mkdir()
         (folder / name / "0.monitor.csv").touch()
     (folder / "Pendulum-v1_11").mkdir()  # without anything in it
+    # The latest without a model only where no run has one
+    assert [one.path.name for one in find_runs(folder)] == [hopper, run.name]
+    shutil.copy(run / "best_model.zip", folder / "Pendulum-v1_2")
+    assert [one.path.name for one in find_runs(folder)] == [hopper, "Pendulum-v1_2"]
+    for path in folder.glob("*/*.zip"):
+        path.unlink()
     assert [one.path.name for one in find_runs(folder)] == [hopper, "Pendulum-v1_10"]
 
 

@@ -13,6 +13,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 import gymnasium as gym
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 import yaml
@@ -139,15 +140,33 @@ def test_a_training_is_filmed(zoo, logs, monkeypatch):
 
 
 @needs("seaborn")
-def test_results_are_plotted(zoo, logs, capsys):
+def test_results_are_plotted(zoo, logs, capsys, monkeypatch):
     zoo("plot_train", "-a", "causalgdp", "-e", "Pendulum-v1", "-f", "logs", "-w", 1)
     # Both runs have two evaluations
     zoo("all_plots", "-a", "causalgdp", "-e", "Pendulum-v1", "-f", "logs", "-o", "results", "--no-million")
     assert "CAUSALGDP" in capsys.readouterr().out
     with open("results.pkl", "rb") as file:
         assert pickle.load(file)["Pendulum-v1"]["CAUSALGDP-logs"]["last_evals"].shape == (2,)
+    titles = []
+    monkeypatch.setattr(plt, "title", lambda label, **kwargs: titles.append(label))
     zoo("plot_from_file", "-i", "results.pkl", "-o", "curves.png", "--format", "png", "--no-million")
     assert Path("curves.png").stat().st_size > 0
+    assert titles == ["Pendulum-v1", "Sensitivity plot", "Last evaluations"]
+
+
+def test_mazes_have_success_rates(zoo, tiny, folder, capsys):
+    pytest.importorskip("gymnasium_robotics")
+    maze = ("--env", "PointMaze_UMaze-v3", "-f", "logs", "--env-kwargs", "max_episode_steps:10")
+    (folder / "entry.yml").write_text("PointMaze_UMaze-v3: {policy: MultiInputPolicy, n_timesteps: 60}")
+    training = ("train", *maze, "-conf", "entry.yml", "--eval-freq", 30, "--eval-episodes", 2, "--log-interval", 1)
+    zoo(*training, *tiny, "learning_starts:50")
+    printed = " ".join(capsys.readouterr().out.split())
+    for part in ("rollout/", "eval/"):
+        assert "| success_rate | 0 | " in printed.split(f"| {part} | |")[1].split("time/")[0]
+    with np.load(folder / "logs" / "causalgdp" / "PointMaze_UMaze-v3_1" / "evaluations.npz") as evaluations:
+        assert evaluations["successes"].shape == (2, 2)
+    zoo("enjoy", "--env", "PointMaze_UMaze-v3", "-f", "logs", "-n", 12, "--no-render")
+    assert "Success rate: " in capsys.readouterr().out
 
 
 def test_a_model_goes_to_the_hub_and_comes_back(zoo, tiny, folder, monkeypatch, capsys):
@@ -182,7 +201,7 @@ def test_a_model_goes_to_the_hub_and_comes_back(zoo, tiny, folder, monkeypatch, 
     zoo("push_to_hub", *pendulum, "-f", "logs", "-orga", "me", "--no-render")
     card = (hub / "me" / "causalgdp-InvertedPendulum-v5" / "README.md").read_text()
     assert "**CausalGDP** Agent" in card and "python -m sb3_causalgdp.zoo enjoy --algo causalgdp" in card
-    assert "rl_zoo3." not in card and 'pip install "sb3_causalgdp[zoo]"' in card
+    assert "rl_zoo3." not in card and 'pip install "./sb3_causalgdp[zoo]"' in card
     zoo("load_from_hub", *pendulum, "-f", "downloaded", "-orga", "me")
     zoo("enjoy", *pendulum, "-f", "downloaded", "--no-render", "-n", 30)
     assert "Mean reward" in capsys.readouterr().out

@@ -17,6 +17,7 @@ pytest.importorskip("rl_zoo3")
 optuna = pytest.importorskip("optuna")
 
 import sb3_causalgdp.zoo.manager  # noqa: E402
+from sb3_causalgdp.zoo.run_folder import find_runs  # noqa: E402
 from sb3_causalgdp.zoo.search_space import convert_causalgdp_params, sample_causalgdp_params  # noqa: E402
 
 PENDULUM = ("--algo", "causalgdp", "--env", "Pendulum-v1", "-f", "logs", "--num-threads", "1", "--device", "cpu")
@@ -93,15 +94,20 @@ def test_a_search_is_stored_and_its_trials_are_trained_again(zoo, folder, capsys
     assert list((folder / "logs" / "causalgdp").glob("report_Pendulum-v1_2-trials-60-tpe-median_*.csv"))
     study = study_of(folder)
     assert [trial.state.name for trial in study.trials] == ["COMPLETE", "COMPLETE"]
+    # No run, which enjoy and report would take for the latest
+    assert not list((folder / "logs" / "causalgdp").glob("Pendulum-v1_*"))
     # The very first trial, too; the command line has the last word
     for trial_id in (0, 1):
         again = ("--trial-id", trial_id, "--eval-freq", -1, "-n", 20, "-params", "eta:0.125")
         zoo("train", *PENDULUM, *STUDY, *again, "-conf", "entry.yml")
-    for run, trial in zip((2, 3), study.trials, strict=True):
+    for run, trial in zip((1, 2), study.trials, strict=True):
         model = CausalGDP.load(folder / "logs" / "causalgdp" / f"Pendulum-v1_{run}" / "Pendulum-v1.zip", device="cpu")
         wanted = convert_causalgdp_params(trial.params)
         assert model.eta == 0.125 and model.learning_rate == wanted["learning_rate"]
         assert model.policy_kwargs == {"activation_fn": "tanh", **wanted["policy_kwargs"]}
+    zoo("train", *PENDULUM, *STUDY, *search, "--no-optim-plots", "-conf", "entry.yml", "--n-trials", 1)
+    zoo("enjoy", *PENDULUM, "-f", "logs", "-n", 3, "--no-render")
+    assert [one.path.name for one in find_runs(folder / "logs" / "causalgdp")] == ["Pendulum-v1_2"]
 
 
 def test_two_processes_at_once_share_a_search(folder):

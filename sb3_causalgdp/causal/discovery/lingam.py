@@ -10,8 +10,9 @@ from sb3_causalgdp.causal.statistics.degenerate import LimitsFinder, find_degene
 from sb3_causalgdp.causal.statistics.moments import StreamingMoments
 from sb3_causalgdp.causal.statistics.recent_rows import RecentRows, checked_rows
 from sb3_causalgdp.causal.variables import TransitionVariables
+from sb3_causalgdp.hints import how_to_install
 
-LINGAM_HINT = 'the package lingam is needed for direct_lingam: pip install "sb3_causalgdp[lingam]"'
+LINGAM_HINT = f"the package lingam is needed for direct_lingam: {how_to_install('lingam')}"
 
 
 def _lingam() -> Any:

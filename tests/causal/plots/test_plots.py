@@ -391,5 +391,5 @@ def test_missing_library_says_what_to_install(monkeypatch, missing):
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.delattr(causal, "plots")
     monkeypatch.setitem(sys.modules, missing, None)
-    with pytest.raises(ImportError, match=r'pip install "sb3_causalgdp\[plots\]"'):
+    with pytest.raises(ImportError, match=r"pip install matplotlib networkx pandas"):
         make_graph().plot()
