@@ -19,6 +19,8 @@ from sb3_causalgdp.causal.interventions import (
     StructuralModel,
     Trajectory,
 )
+from sb3_causalgdp.causal.relevance import Relevance
+from sb3_causalgdp.causal.relevance_gate import RelevanceGate, Verdict
 from sb3_causalgdp.causal.statistics.moments import StreamingMoments
 from sb3_causalgdp.causal.variables import TransitionVariables
 from sb3_causalgdp.causal.world_model import MaskedWorldModel
@@ -34,6 +36,8 @@ __all__ = [
     "InterventionalDistribution",
     "LinearisedGuidance",
     "MaskedWorldModel",
+    "Relevance",
+    "RelevanceGate",
     "ReturnTarget",
     "RewardTarget",
     "Statistics",
@@ -41,6 +45,7 @@ __all__ = [
     "StructuralModel",
     "Trajectory",
     "TransitionVariables",
+    "Verdict",
     "discover",
     "make_discovery",
     "make_statistics",
