@@ -30,7 +30,8 @@ class Relevance:
     :param actions: The same from each action, shape (d,)
     :param states_upper: Upper bound of the probability that there is any path, were the edges independent, shape (n,)
     :param actions_upper: The same from each action, shape (d,)
-    :param state_lengths: Edges of the shortest path from each state over edges above one half, 0 where there is none, shape (n,)
+    :param state_lengths: Edges of the shortest path from each state over edges above one half, 0 where there is none, shape
+        (n,)
     :param action_lengths: The same from each action, shape (d,)
     :param state_paths: Of each state, the names along the surest path, the state's first and ``"reward"`` last; empty where
         there is none
@@ -88,13 +89,13 @@ class Relevance:
 
 def relevance_of(graph: "CausalGraph") -> Relevance:
     """
-    The surest paths to the reward: with p(i -> j) the probability that state i causes the next state j and q(j) that the reward
-    reads state j, ``R_j = max(q(j), max_l p(j -> l) R_l)`` is the relevance of a state, and ``max(q_a(k), max_j p(k -> j) R_j)``
-    that of action k. A state that the reward reads is relevant, whether or not it was seen to last for a step.
+    The surest paths to the reward: with p(i -> j) the probability that state i causes the next state j and q(j) that the
+    reward reads state j, ``R_j = max(q(j), max_l p(j -> l) R_l)`` is the relevance of a state, and ``max(q_a(k), max_j p(k ->
+    j) R_j)`` that of action k. A state that the reward reads is relevant, whether or not it was seen to last for a step.
 
-    Probabilities are the graph's ``evidence`` that there is any effect, or its masks where the method has none. The surest path is
-    a lower bound of the probability of any path, were the edges independent; the upper bound is that of a cut: the edges that
-    leave the variable, or those that leave all that it reaches by edges above 0.05, whichever is smaller.
+    Probabilities are the graph's ``evidence`` that there is any effect, or its masks where the method has none. The surest
+    path is a lower bound of the probability of any path, were the edges independent; the upper bound is that of a cut: the
+    edges that leave the variable, or those that leave all that it reaches by edges above 0.05, whichever is smaller.
 
     Assumes that the variables are the whole state, or keep what predicts it: what matters only through something that is not
     observed, or only two steps later, is not seen.

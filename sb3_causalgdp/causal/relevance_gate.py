@@ -36,15 +36,16 @@ class RelevanceGate:
 
     It closes nothing that it cannot judge. A whole graph says nothing when
 
-    - the reward has not varied yet, or less than ``min_reward_r2`` of its variance is explained (a sparse reward that never came
-      makes everything irrelevant);
+    - the reward has not varied yet, or less than ``min_reward_r2`` of its variance is explained (a sparse reward that never
+      came makes everything irrelevant);
     - no action is known to matter (relevance below ``known``): then how the reward comes about has not been found.
 
-    It counts, but nothing is closed by it, when an effect of a partial R^2 of ``detectable`` on the reward or on half of the relevant
-    states could have been missed; or, where the method does not say, with fewer than ten rows for each state and action.
+    It counts, but nothing is closed by it, when an effect of a partial R^2 of ``detectable`` on the reward or on half of the
+    relevant states could have been missed; or, where the method does not say, with fewer than ten rows for each state and
+    action.
 
-    Single variables are not judged that never moved, are linearly dependent on others or nearly so (variance inflation over 40),
-    or are named in ``keep_open``, such as goals that were not reached yet. What cannot be judged keeps its verdict.
+    Single variables are not judged that never moved, are linearly dependent on others or nearly so (variance inflation over
+    40), or are named in ``keep_open``, such as goals that were not reached yet. What cannot be judged keeps its verdict.
 
     :param variables: Names and order of the variables, n states and d actions
     :param low: Relevance below which a variable may be closed, in [0, ``high``]
@@ -148,7 +149,11 @@ class RelevanceGate:
         relevant = states > self.high
         of_states = float(np.median(graph.detectable_r2[:-1][relevant])) if relevant.any() else 0.0
         missed = max(of_states, float(graph.detectable_r2[-1]))
-        return f"too few transitions: effects of a partial R^2 of {missed:.3f} could be missed" if missed > self.detectable else ""
+        return (
+            f"too few transitions: effects of a partial R^2 of {missed:.3f} could be missed"
+            if missed > self.detectable
+            else ""
+        )
 
     def _unjudged(self, graph: CausalGraph) -> np.ndarray:
         """Which variables this graph says nothing about, shape (n + d,)."""

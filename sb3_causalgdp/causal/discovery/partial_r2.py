@@ -46,8 +46,8 @@ def edge_probability(partial_r2: np.ndarray, log_error: np.ndarray, threshold: f
 
 def edge_evidence(f_statistic: np.ndarray, n_features: np.ndarray | float, freedom: float, n_tests: int) -> np.ndarray:
     """
-    Probability that there is an edge at all, however weak: ``1 / (1 + exp[(z0^2 - z^2) / 2])``, with z the F-test's statistic as
-    a standard normal variable (Wilson and Hilferty's cube roots), and z0 what 1 in 100 whole graphs without any edge exceed
+    Probability that there is an edge at all, however weak: ``1 / (1 + exp[(z0^2 - z^2) / 2])``, with z the F-test's statistic
+    as a standard normal variable (Wilson and Hilferty's cube roots), and z0 what 1 in 100 whole graphs without any edge exceed
     somewhere (Bonferroni).
 
     :param f_statistic: At least 0, any shape
@@ -101,10 +101,10 @@ class PartialR2:
     block is one Newton step from the solution, which makes the errors those of cluster-robust inference (Cameron and Miller,
     2015, "A practitioner's guide to cluster-robust inference").
 
-    Evidence is another probability: that of an effect at all, however weak. It comes from two F-tests, of the same features and of
-    the one that is linear in the cause, corrected for the number of tests and for rows that depend on each other: by the factor
-    by which the sums of features times residuals over blocks of rows vary more than those of independent rows (the design effect
-    of cluster sampling, Kish, 1965).
+    Evidence is another probability: that of an effect at all, however weak. It comes from two F-tests, of the same features
+    and of the one that is linear in the cause, corrected for the number of tests and for rows that depend on each other: by
+    the factor by which the sums of features times residuals over blocks of rows vary more than those of independent rows (the
+    design effect of cluster sampling, Kish, 1965).
 
     An effect is the difference of the target, in its standard deviations, when a cause moves from half a standard deviation
     below to half a one above, the others as they are: its size is the mean of the absolute difference over the newest 256
@@ -214,7 +214,7 @@ class PartialR2:
         )
 
     def _estimate(self, regression: "_Regression", n_tests: int) -> tuple[np.ndarray, ...]:
-        """Masks, effects and their standard errors, each of shape (m, p), R^2, evidence, shape (m, p), and what it could see."""
+        """Masks, effects, their standard errors, each of shape (m, p), R^2, evidence, shape (m, p), and what it could see."""
         whole = regression.whole
         logs, effects, shares = [], [], []
         for part, share in regression.parts():
