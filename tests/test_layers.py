@@ -19,7 +19,7 @@ LAYERS = [
     {"acceleration.product_pass"},
     {"policies"},
     {"acceleration.acting", "arguments", "saving.models"},
-    {"causal", "offline", "diffusion"},
+    {"causal", "offline", "diffusion", "stress"},
     {"checks", "divergence", "files", "acceleration.products", "acceleration.activations", "saving.plain", "saving.archives"},
     {"saving.numpy_pickles", "acceleration", "saving", "moved"},
 ]
@@ -30,6 +30,7 @@ WITHOUT_SB3 = {
     "files",
     "losses",
     "moved",
+    "stress",
     "acceleration.gradients",
     "acceleration.products",
     "acceleration.product_pass",
