@@ -117,7 +117,8 @@ class CausalGraph:
         matrix = (n_states + 1, n_states + n_actions)
         self.masks = _checked("masks", self.masks, matrix)
         self.effects = _checked("effects", self.effects, matrix)
-        row, optional = matrix[:1], {"standard_errors": matrix, "evidence": matrix}
+        row: tuple[int, ...] = matrix[:1]
+        optional: dict[str, tuple[int, ...]] = {"standard_errors": matrix, "evidence": matrix}
         optional |= {"r_squared": row, "detectable_r2": row, "action_vif": (n_actions,), "state_vif": (n_states,)}
         for name, shape in optional.items():
             if getattr(self, name) is not None:

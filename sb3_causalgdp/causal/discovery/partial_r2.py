@@ -7,7 +7,7 @@ from scipy.linalg import cho_solve
 from scipy.special import expit, ndtri
 
 from sb3_causalgdp.causal.graph import CausalGraph
-from sb3_causalgdp.causal.statistics.basis import BASES, BasisExpansion, BasisMoments, bytes_needed
+from sb3_causalgdp.causal.statistics.basis import BASES, N_FUNCTIONS, BasisExpansion, BasisMoments, bytes_needed
 from sb3_causalgdp.causal.statistics.degenerate import Degeneracy, LimitsFinder
 from sb3_causalgdp.causal.statistics.grouped import GroupedStatistics
 from sb3_causalgdp.causal.statistics.jackknife import jackknife_error
@@ -101,10 +101,11 @@ class PartialR2:
     block is one Newton step from the solution, which makes the errors those of cluster-robust inference (Cameron and Miller,
     2015, "A practitioner's guide to cluster-robust inference").
 
-    Evidence is another probability: that of an effect at all, however weak. It comes from two F-tests, of the same features
-    and of the one that is linear in the cause, corrected for the number of tests and for rows that depend on each other: by
-    the factor by which the sums of features times residuals over blocks of rows vary more than those of independent rows (the
-    design effect of cluster sampling, Kish, 1965).
+    Evidence is another probability: that of an effect at all, however weak. It comes from F-tests of the same features (where
+    there are products, no larger than the mask), of those that are functions of the cause alone and of the one that is linear
+    in it, corrected for the number of tests and for rows that depend on each other: by the factor by which the sums of
+    features times residuals over blocks of rows vary more than those of independent rows (the design effect of cluster
+    sampling, Kish, 1965).
 
     An effect is the difference of the target, in its standard deviations, when a cause moves from half a standard deviation
     below to half a one above, the others as they are: its size is the mean of the absolute difference over the newest 256
@@ -224,7 +225,7 @@ class PartialR2:
         log_error = jackknife_error(self._log(whole), logs, shares)
         masks = edge_probability(whole.partial_r2, log_error, self.threshold, self.spread)
         effect_errors = jackknife_error(whole.effects, effects, shares).T
-        evidence, detectable = regression.evidence(n_tests)
+        evidence, detectable = regression.evidence(n_tests, masks)
         return masks.T, whole.effects.T, effect_errors, regression.r_squared(), evidence.T, detectable
 
     def _log(self, estimates: "_Estimates") -> np.ndarray:
@@ -259,14 +260,15 @@ class _Tests(NamedTuple):
     :param n_features: Number of features that are left out and in use, shape (q, 1)
     :param features: Indices of the features that are left out, shape (q, g)
     :param spread: Covariance of these features given all others, ``[(S^-1)_GG]^-1``, shape (q, g, g)
-    :param spread_of_rest: The same of all of them but the first, which is linear; None for groups and single features
+    :param spreads_behind: By a number of first features, the same of all others: of those behind the linear one, and of the
+        products; empty for groups and single features
     """
 
     causes: np.ndarray
     n_features: np.ndarray
     features: th.Tensor
     spread: th.Tensor
-    spread_of_rest: th.Tensor | None
+    spreads_behind: dict[int, th.Tensor]
 
 
 class _Fit(NamedTuple):
@@ -382,23 +384,29 @@ class _Regression:
             residual = np.sum(squares[:i] + squares[i + 1 :], axis=0) / rest.count
             yield self._estimates(self._step(steps[:, i], residual, rest)), block.count / self.total.count
 
-    def evidence(self, n_tests: int) -> tuple[np.ndarray, np.ndarray]:
+    def evidence(self, n_tests: int, masks: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """
         :param n_tests: Number of edges that are tested in the whole graph
+        :param masks: Of the edges, shape (p, m)
         :return: evidence for the edges, shape (p, m), and the partial R^2 that it could see, shape (m,)
         """
         evidence, unit = np.zeros(self.shape), self.freedom / (self.fit.residual * self.design_effect)
         for test in self.tests:
             explained = self._explained(self.fit, test.features, test.spread).numpy()
-            found = edge_evidence(explained * unit / test.n_features, test.n_features, self.freedom, 2 * n_tests)
-            if test.spread_of_rest is not None:
-                # What is linear in a cause is seen with fewer rows than what is any function of it
-                linear = explained - self._explained(self.fit, test.features[:, 1:], test.spread_of_rest).numpy()
-                found = np.maximum(found, edge_evidence(np.maximum(linear, 0.0) * unit, 1.0, self.freedom, 2 * n_tests))
+            found = edge_evidence(explained * unit / test.n_features, test.n_features, self.freedom, 3 * n_tests)
+            if test.spreads_behind and test.features.shape[1] > N_FUNCTIONS:
+                # Products are largest where residuals are, too, for which an F-test makes no allowance
+                found = np.minimum(found, masks[test.causes])
+            for n_first, spread in test.spreads_behind.items():
+                # A few features are seen with fewer rows than all
+                behind = self._explained(self.fit, test.features[:, n_first:], spread).numpy()
+                n_used = self.used[test.features.numpy()[:, :n_first]].sum(axis=1, keepdims=True)
+                ratio = np.maximum(explained - behind, 0.0) * unit / n_used
+                found = np.maximum(found, edge_evidence(ratio, n_used, self.freedom, 3 * n_tests))
             evidence[test.causes] = found
         for group in self.degeneracy.groups:
             evidence[list(group)] = evidence[group[0]]
-        return evidence, detectable_effect(1.0, self.freedom, self.design_effect, 2 * n_tests)
+        return evidence, detectable_effect(1.0, self.freedom, self.design_effect, 3 * n_tests)
 
     def _design_effect(self, scores: np.ndarray) -> np.ndarray:
         """From the blocks' scores, shape (F, blocks, m): at least 1, shape (m,)."""
@@ -451,11 +459,10 @@ class _Regression:
             row, column = indices[:, :, None], indices[:, None, :]
             of_features = self.inverse[np.maximum(row, column), np.minimum(row, column)]
             spread = th.linalg.inv(th.from_numpy(of_features))
-            rest = None
-            if n_features > 1 and not of_groups:
-                rest = th.linalg.inv(th.from_numpy(np.ascontiguousarray(of_features[:, 1:, 1:])))
+            firsts = [] if of_groups else [n_first for n_first in (1, N_FUNCTIONS) if n_first < n_features]
+            behind = {n: th.linalg.inv(th.from_numpy(np.ascontiguousarray(of_features[:, n:, n:]))) for n in firsts}
             n_used = self.used[indices].sum(axis=1, keepdims=True)
-            tests.append(_Tests(causes, n_used, th.from_numpy(indices), spread, rest))
+            tests.append(_Tests(causes, n_used, th.from_numpy(indices), spread, behind))
         return tests
 
     def _slopes(
