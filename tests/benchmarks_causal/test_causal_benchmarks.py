@@ -45,7 +45,20 @@ def test_a_queue_holds_all_pairs_for_the_other_runner(tmp_path):
 def test_the_gate_is_judged_without_training(tmp_path):
     pytest.importorskip("mujoco")
     output = tmp_path / "relevance.csv"
-    arguments = ["--noises", 5, "--idle-actions", 1, "--seeds", 0, "--steps", 3000, "--behaviours", "random", "--output", output]
+    arguments = [
+        "--noises",
+        5,
+        "--idle-actions",
+        1,
+        "--seeds",
+        0,
+        "--steps",
+        3000,
+        "--behaviours",
+        "random",
+        "--output",
+        output,
+    ]
     call("causal/relevance.py", *arguments)
     (row,) = csv.DictReader(output.open())
     assert row["behaviour"] == "random" and row["own_closed"] == "0" and row["others_open"] == "6 0 0"
