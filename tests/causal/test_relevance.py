@@ -294,3 +294,14 @@ def test_other_variables_and_unknown_names_are_refused():
         gate.update(make_graph(SURE), keep_open=("goal",))
     with pytest.raises(ValueError, match="graph must be over the variables"):
         gate.update(CausalGraph.fully_connected(TransitionVariables(("x",), ("u",))))
+
+
+def test_evidence_is_kept_in_files_and_missing_in_older_ones():
+    graph = make_graph(CHAIN, evidence=np.full((5, 6), 0.25), detectable_r2=np.full(5, 0.1), state_vif=np.ones(4))
+    assert CausalGraph.from_json(graph.to_json()) == graph
+    content = json.loads(graph.to_json())
+    for name in ("evidence", "detectable_r2", "state_vif"):
+        del content[name]
+    assert CausalGraph.from_json(json.dumps(content)).evidence is None
+    with pytest.raises(ValueError, match="evidence must lie in"):
+        make_graph(CHAIN, evidence=np.full((5, 6), 1.5))
