@@ -329,6 +329,7 @@ CONSTRUCTOR_ARGUMENTS: dict[str, Kind] = {
     "causal_half_life": number(1.0, LARGEST_NUMBER) | NONE,
     "causal_window": integer(8, MOST_STEPS) | NONE,
     "sample_masks": FLAG,
+    "causal_abstraction": FLAG | KEYWORDS,
     "state_names": NAMES | NONE,
     "action_names": NAMES | NONE,
     "offline_dataset": PATH | NONE,
@@ -373,6 +374,7 @@ POLICY_ARGUMENTS: dict[str, Kind] = {
     | NONE,
     **SHARED_ARGUMENTS,
     "discount": SHARE,
+    "causal_abstraction": FLAG,
 }
 """Every argument of :class:`~sb3_causalgdp.policies.CausalGDPPolicy`, what goes into ``policy_kwargs`` among them."""
 

@@ -72,6 +72,7 @@ def denoising_loss(
     actions: th.Tensor,
     guidance: Guidance | None = None,
     rule: GuidanceRule | None = None,
+    gate: th.Tensor | None = None,
 ) -> DenoisingTerms:
     """
     ``E || eps_theta(a^k, k, s) - eps_cg ||^2``: the noise really injected, shifted by the guidance (stop-gradient).
@@ -82,17 +83,26 @@ def denoising_loss(
     :param actions: Clean actions, shape ``(batch, d)``
     :param guidance: What shifts the target, None for the plain denoising loss
     :param rule: How the guidance enters, needed with a guidance
+    :param gate: 0 for components of the actions that are not modelled, 1 for the others, shape ``(d,)``; None models all
     :return: The loss, and what the same noise prediction says of the clean actions
     """
     step = th.randint(schedule.n_steps, (len(actions),), device=actions.device)
     noise = th.randn_like(actions)
+    if gate is not None:
+        actions, noise = actions * gate, noise * gate
     noisy = schedule.add_noise(actions, noise, step)
     predict_noise = bind(denoiser, features)
     predicted = predict_noise(noisy, step)
     clean_action = schedule.clean_estimate(noisy, predicted, step)
     if guidance is not None and rule is not None:
         noise = noise - guidance_shift(guidance, rule, predict_noise, schedule, noisy, predicted.detach(), step)
-    return DenoisingTerms(F.mse_loss(predicted, noise), bounded(clean_action), outside(clean_action))
+    if gate is None:
+        return DenoisingTerms(F.mse_loss(predicted, noise), bounded(clean_action), outside(clean_action))
+    # Means over the components that are modelled
+    share = gate.numel() / gate.sum().clamp(min=1.0)
+    predicted, noise, clean_action = predicted * gate, noise * gate, clean_action * gate
+    loss, beyond = share * F.mse_loss(predicted, noise), share * outside(clean_action)
+    return DenoisingTerms(loss, bounded(clean_action), beyond)
 
 
 def q_loss(values: th.Tensor, others: th.Tensor, of_data: th.Tensor | None = None) -> th.Tensor:

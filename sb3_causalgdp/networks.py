@@ -57,8 +57,18 @@ def q_values(
     :param networks: Which of the networks, all by default
     :return: One tensor of shape ``(batch, 1)`` for each network
     """
-    inputs = th.cat([features, actions], dim=1)
+    inputs = th.cat([features, modelled(critic, actions)], dim=1)
     return [network(inputs) for network in critic.q_networks[networks]]
+
+
+def modelled(network: nn.Module, actions: th.Tensor) -> th.Tensor:
+    """
+    :param network: An actor or critics
+    :param actions: Shape ``(..., d)``
+    :return: The same with 0 for components that the network does not model, if it is one that hides any
+    """
+    gate = getattr(network, "action_gate", None)
+    return actions if gate is None else actions * gate
 
 
 class Critic(PickledAlone, ContinuousCritic):
@@ -67,14 +77,19 @@ class Critic(PickledAlone, ContinuousCritic):
 
     :param normalization: ``layer`` normalises hidden layers before their activation, ``batch`` the inputs of each layer over
         the batch, as in CrossQ; None for none
+    :param gates_actions: Whether components of actions can be hidden from it, by the buffer ``action_gate``
     :param kwargs: Keyword arguments of SB3's critics
     """
 
     BATCH_NORM_MOMENTUM = 0.01
     BATCH_NORM_EPSILON = 1e-3
 
-    def __init__(self, normalization: str | None = None, **kwargs: Any) -> None:
+    action_gate: th.Tensor | None
+
+    def __init__(self, normalization: str | None = None, gates_actions: bool = False, **kwargs: Any) -> None:
         super().__init__(**kwargs)
+        gate = th.ones(get_action_dim(kwargs["action_space"])) if gates_actions else None
+        self.register_buffer("action_gate", gate, persistent=False)
         n_inputs = kwargs["features_dim"] + get_action_dim(kwargs["action_space"])
         norms: dict[str, list[Any]] = {}
         if normalization == "layer":
@@ -91,6 +106,9 @@ class Critic(PickledAlone, ContinuousCritic):
             make_layers_fast(network)
         modules = (module for network in self.q_networks for module in network.modules())
         self._batch_norms = tuple(module for module in modules if isinstance(module, nn.BatchNorm1d))
+
+    def forward(self, obs: PyTorchObs, actions: th.Tensor) -> tuple[th.Tensor, ...]:
+        return super().forward(obs, modelled(self, actions))
 
     @property
     def normalizes_batches(self) -> bool:
@@ -150,7 +168,11 @@ class DiffusionActor(PickledAlone, BasePolicy):
     :param ddim_eta: Noise of DDIM, in [0, 1]
     :param prediction_type: What the denoiser predicts: ``noise``, or ``velocity``, see
         :class:`~sb3_causalgdp.diffusion.MLPDenoiser`
+    :param gates_actions: Whether there can be components of actions that it does not model, which are then 0, by the buffer
+        ``action_gate``
     """
+
+    action_gate: th.Tensor | None
 
     # Noise's share of the variance from which an action is adapted to a state near by
     ADAPTING_NOISE = 0.1
@@ -169,6 +191,7 @@ class DiffusionActor(PickledAlone, BasePolicy):
         sampler: str = "ddpm",
         ddim_eta: float = 0.0,
         prediction_type: str = "velocity",
+        gates_actions: bool = False,
     ) -> None:
         super().__init__(
             observation_space,
@@ -179,6 +202,7 @@ class DiffusionActor(PickledAlone, BasePolicy):
         )
         check_sampler(sampler, ddim_eta)
         self.action_dim = get_action_dim(action_space)
+        self.register_buffer("action_gate", th.ones(self.action_dim) if gates_actions else None, persistent=False)
         self.net_arch = net_arch
         self.features_dim = features_dim
         self.activation_fn = activation_fn
@@ -205,6 +229,7 @@ class DiffusionActor(PickledAlone, BasePolicy):
             sampler=self.sampler,
             ddim_eta=self.ddim_eta,
             prediction_type=self.prediction_type,
+            gates_actions=self.action_gate is not None,
         )
         return data
 
@@ -233,7 +258,12 @@ class DiffusionActor(PickledAlone, BasePolicy):
         :param divergences: If a list, each guided step appends its KL divergence
         :return: Actions in [-1, 1], shape ``(batch, d)``
         """
-        return sample(
+        if self.action_gate is not None:
+            if noise is None:
+                shape = (self.schedule.n_steps, len(features), self.action_dim)
+                noise = th.randn(shape, dtype=features.dtype, device=features.device)
+            noise = modelled(self, noise)
+        action = sample(
             self.denoiser,
             self.schedule,
             features,
@@ -244,6 +274,8 @@ class DiffusionActor(PickledAlone, BasePolicy):
             eta=self.ddim_eta,
             divergences=divergences,
         )
+        # Guidance may have moved what is not modelled
+        return modelled(self, action)
 
     def adapt(self, features: th.Tensor, action: th.Tensor) -> th.Tensor:
         """
@@ -255,8 +287,9 @@ class DiffusionActor(PickledAlone, BasePolicy):
         :return: Actions in [-1, 1], shape ``(batch, d)``
         """
         step = th.full((len(action),), self.adapting_step, device=action.device)
-        noisy = self.schedule.add_noise(action, th.zeros_like(action), step)
-        return self.schedule.clean_estimate(noisy, bind(self.denoiser, features)(noisy, step), step).clamp(-1.0, 1.0)
+        noisy = self.schedule.add_noise(modelled(self, action), th.zeros_like(action), step)
+        clean = self.schedule.clean_estimate(noisy, bind(self.denoiser, features)(noisy, step), step).clamp(-1.0, 1.0)
+        return modelled(self, clean)
 
     def forward(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         features = self.features(observation)

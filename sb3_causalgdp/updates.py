@@ -302,7 +302,8 @@ class Updates:
                     predicted, _ = self.world_model.predict_next_state(state, transitions.actions)
                 next_state = th.where(transitions.dones > 0.0, predicted, next_state)
             guidance = self.policy.make_guidance(state, next_state, next_actions, climbed)
-        denoising = denoising_loss(self.actor.denoiser, self.actor.schedule, features, transitions.actions, guidance, rule)
+        denoiser, schedule, gate = self.actor.denoiser, self.actor.schedule, self.actor.action_gate
+        denoising = denoising_loss(denoiser, schedule, features, transitions.actions, guidance, rule, gate)
         actions = denoising.clean_actions if self.model.actor_update == "one_step" else self.actor.sample(features)
         return denoising, self.q_term(observations, actions, transitions.actions, climbed)
 

@@ -19,7 +19,7 @@ LAYERS = [
     {"policies", "acceleration.device_replay", "acceleration.cuda_graphs", "acceleration.gradients"},
     {"prediction", "acceleration.product_pass"},
     {"networks", "acceleration.acting"},
-    {"saving.policies", "acceleration.numpy_networks"},
+    {"saving.policies", "acceleration.numpy_networks", "abstraction"},
     {"arguments", "names", "saving.models"},
     {"causal.__main__"},
     {"causal", "offline", "diffusion", "stress"},
@@ -61,6 +61,7 @@ WITHOUT_SB3 = {
     "acceleration.fast_steps",
     "acceleration.numpy_networks",
     "acceleration.switch",
+    "abstraction",
 }
 LEVELS = {part: level for level, parts in enumerate(LAYERS) for part in parts}
 FILES = sorted(PACKAGE.rglob("*.py"))

@@ -98,6 +98,11 @@ class RelevanceGate:
         """Which actions are open, a copy, shape (d,)."""
         return self._open[self.variables.n_states :].copy()
 
+    @property
+    def settings(self) -> dict[str, float | int]:
+        """What the constructor was given, by name."""
+        return {name: getattr(self, name) for name in ("low", "high", "patience", "detectable", "known", "min_reward_r2")}
+
     def update(self, graph: CausalGraph, *, reward_varied: bool = True, keep_open: Iterable[str] = ()) -> Verdict:
         """
         Judge by a new graph.
@@ -183,11 +188,10 @@ class RelevanceGate:
         """
         :return: settings, names, verdict and counts as lists and numbers, which JSON can hold
         """
-        settings = ("low", "high", "patience", "detectable", "known", "min_reward_r2")
         return {
             "state_names": list(self.variables.state_names),
             "action_names": list(self.variables.action_names),
-            **{name: getattr(self, name) for name in settings},
+            **self.settings,
             "open": self._open.tolist(),
             "n_low": self._n_low.tolist(),
         }
