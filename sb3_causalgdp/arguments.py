@@ -20,8 +20,8 @@ from stable_baselines3.common.vec_env import VecEnv
 from torch import nn
 
 from sb3_causalgdp.causal.discovery import DISCOVERY_METHODS
-from sb3_causalgdp.diffusion.guidance import GUIDANCE_COVARIANCES, GUIDANCE_MODES
 from sb3_causalgdp.diffusion.denoiser_types import DENOISERS
+from sb3_causalgdp.diffusion.guidance import GUIDANCE_COVARIANCES, GUIDANCE_MODES
 from sb3_causalgdp.diffusion.plans import SAMPLERS
 from sb3_causalgdp.diffusion.schedules import NOISE_SCHEDULES
 from sb3_causalgdp.offline.rewards import REWARD_TRANSFORMS
@@ -334,6 +334,7 @@ CONSTRUCTOR_ARGUMENTS: dict[str, Kind] = {
     "causal_half_life": number(1.0, LARGEST_NUMBER) | NONE,
     "causal_window": integer(8, MOST_STEPS) | NONE,
     "sample_masks": FLAG,
+    "causal_abstraction": FLAG | KEYWORDS,
     "state_names": NAMES | NONE,
     "action_names": NAMES | NONE,
     "offline_dataset": PATH | NONE,
@@ -391,6 +392,7 @@ POLICY_ARGUMENTS: dict[str, Kind] = {
     "discount": SHARE,
     "one_pass": FLAG,
     "value_network": FLAG,
+    "causal_abstraction": FLAG,
 }
 """Every argument of :class:`~sb3_causalgdp.policies.CausalGDPPolicy`, what goes into ``policy_kwargs`` among them."""
 

@@ -128,6 +128,10 @@ class CausalGDP(AskedAlgorithm, SavedAlgorithm):
     :param sample_masks: How the world model trains on its masks. True: as probabilities, which edges are there is drawn anew
         for each batch, so that an improbable edge carries little. False: as factors of the inputs, which what is learned
         behind them makes up for unless they are 0
+    :param causal_abstraction: Whether actor and critics see only what can matter for any future reward by the graphs of the
+        training, and model only such actions; others are the middle of their range plus exploration noise. A dictionary holds
+        arguments of :class:`~sb3_causalgdp.causal.RelevanceGate`, and ``keep_open``, a list of names of states and actions
+        that are never hidden
     :param state_names: Names of the observation's components in graphs, pictures and answers; None takes the environment's own
         (see :func:`~sb3_causalgdp.names.found_names`), or where it has none keys and indices
     :param action_names: The same for the components of the actions
@@ -228,6 +232,7 @@ class CausalGDP(AskedAlgorithm, SavedAlgorithm):
         causal_half_life: float | None = None,
         causal_window: int | None = None,
         sample_masks: bool = True,
+        causal_abstraction: bool | dict[str, Any] = False,
         state_names: Sequence[str] | None = None,
         action_names: Sequence[str] | None = None,
         offline_dataset: str | None = None,
@@ -316,6 +321,7 @@ class CausalGDP(AskedAlgorithm, SavedAlgorithm):
         self.causal_half_life = causal_half_life
         self.causal_window = causal_window
         self.sample_masks = sample_masks
+        self.causal_abstraction = causal_abstraction
         self.state_names = state_names
         self.action_names = action_names
         self.compile = compile
@@ -397,7 +403,8 @@ class CausalGDP(AskedAlgorithm, SavedAlgorithm):
         own = {name: getattr(self, name) for name in names}
         own["exploration_noise"] = FloatSchedule(self.exploration_noise)(1.0)
         networks = {"one_pass": self.actor_update == "trust_region", "value_network": self.expectile is not None}
-        return {**own, "discount": self.gamma, **{name: True for name, is_asked in networks.items() if is_asked}}
+        asked = {name: True for name, is_asked in networks.items() if is_asked}
+        return {**own, "discount": self.gamma, "causal_abstraction": self.causal_abstraction is not False, **asked}
 
     def _create_aliases(self) -> None:
         self.actor = self.policy.actor
@@ -599,6 +606,7 @@ class CausalGDP(AskedAlgorithm, SavedAlgorithm):
             "_checkpoints",
             "_resumed_at_gradient_step",
             "causal_graph_history",
+            "relevance_gate",
         ]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:

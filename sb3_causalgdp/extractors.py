@@ -1,5 +1,7 @@
 """Features of observations in standard deviations, as the world model measures them, so that nobody needs VecNormalize."""
 
+import math
+
 import torch as th
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, CombinedExtractor, FlattenExtractor
 from stable_baselines3.common.type_aliases import PyTorchObs
@@ -8,9 +10,10 @@ from stable_baselines3.common.type_aliases import PyTorchObs
 class StandardizedExtractor(BaseFeaturesExtractor):
     """
     The features of another extractor minus their means, in standard deviations, within [-10, 10]. Until
-    :meth:`set_statistics` is called they are as they are.
+    :meth:`set_statistics` is called they are as they are. A feature whose ``inverse_std`` is 0 is hidden: it is 0.
 
     :param extractor: Gives the observation flattened
+    :param standardizes: False only hides features, and leaves the others as they are
     """
 
     BOUND = 10.0
@@ -18,9 +21,11 @@ class StandardizedExtractor(BaseFeaturesExtractor):
     mean: th.Tensor
     inverse_std: th.Tensor
 
-    def __init__(self, extractor: BaseFeaturesExtractor) -> None:
+    def __init__(self, extractor: BaseFeaturesExtractor, standardizes: bool = True) -> None:
         super().__init__(extractor._observation_space, extractor.features_dim)
         self.extractor = extractor
+        self.standardizes = standardizes
+        self.bound = self.BOUND if standardizes else math.inf
         self.register_buffer("mean", th.zeros(extractor.features_dim))
         self.register_buffer("inverse_std", th.ones(extractor.features_dim))
 
@@ -43,4 +48,4 @@ class StandardizedExtractor(BaseFeaturesExtractor):
 
     def forward(self, observations: PyTorchObs) -> th.Tensor:
         standardized = (self.extractor(observations) - self.mean) * self.inverse_std
-        return standardized.clamp(-self.BOUND, self.BOUND)
+        return standardized.clamp(-self.bound, self.bound)

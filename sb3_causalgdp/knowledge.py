@@ -7,9 +7,19 @@ from dataclasses import replace
 from typing import Any, TypeVar
 
 import torch as th
+from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
 
-from sb3_causalgdp.causal import CausalGraph, Statistics, TransitionVariables, make_discovery, make_statistics
+from sb3_causalgdp.arguments import check_keywords
+from sb3_causalgdp.causal import (
+    CausalGraph,
+    RelevanceGate,
+    Statistics,
+    TransitionVariables,
+    Verdict,
+    make_discovery,
+    make_statistics,
+)
 from sb3_causalgdp.causal.world_model import MaskedWorldModel
 from sb3_causalgdp.names import found_names
 from sb3_causalgdp.offline.algorithm import OfflineToOnlineAlgorithm
@@ -36,6 +46,9 @@ class DiscoveringAlgorithm(OfflineToOnlineAlgorithm):
     causal_window: int | None
     state_names: Sequence[str] | None
     action_names: Sequence[str] | None
+    causal_abstraction: bool | dict[str, Any]
+    relevance_gate: RelevanceGate | None
+    """The verdict on what actor and critics see; None without ``causal_abstraction``."""
     _updates: Updates
 
     GRAPHS_IN_HISTORY = 32
@@ -47,6 +60,7 @@ class DiscoveringAlgorithm(OfflineToOnlineAlgorithm):
         self._statistics_made_by: list[Any] | None = None
         self._causal_graph: CausalGraph | None = None
         self.causal_graph_history: list[CausalGraph] = []
+        self._relevance_verdict: dict[str, Any] | None = None
         self._steps_since_refresh = 0
         # Positions of the replay buffer that were ever written, and how many of them the statistics have seen
         self._stored_position = 0
@@ -92,12 +106,76 @@ class DiscoveringAlgorithm(OfflineToOnlineAlgorithm):
         age = self.n_environment_steps - graph.num_timesteps
         return [*super().progress_parts(), edges, f"graph {age:,} steps old"]
 
+    def judge_relevance(self, graph: CausalGraph) -> Verdict | None:
+        """
+        Let the gate judge by a new graph, and hide what it has closed from actor and critics.
+
+        :param graph: On this model's variables
+        :return: The verdict, None without ``causal_abstraction``
+        """
+        gate = self.relevance_gate
+        if gate is None:
+            return None
+        # Where no state is known to matter, as before a sparse reward was seen, all that was found may be a cost of actions
+        is_known = bool((graph.relevance().states > gate.high).any())
+        verdict = gate.update(graph, reward_varied=is_known, keep_open=self._never_hidden())
+        self._relevance_verdict = gate.state_dict()
+        self.policy.show(th.as_tensor(verdict.states), th.as_tensor(verdict.actions))
+        return verdict
+
+    def _never_hidden(self) -> list[str]:
+        names, indices = self.transition_variables, self._indices
+        kept = list(self._abstraction_options()[1])
+        keys = self.observation_space.spaces if isinstance(self.observation_space, spaces.Dict) else ()
+        if "desired_goal" in keys:
+            # The reward reads them, also where no episode has come near a goal yet
+            goals = ("desired_goal[", "achieved_goal[")
+            pairs = zip(indices.state_names, names.state_names, strict=True)
+            kept += [name for index, name in pairs if index.startswith(goals)]
+        if self.policy.exploration_noise == 0.0 and self.action_noise is None:
+            # What never moves again is never found to matter
+            kept += names.action_names
+        return kept
+
+    def _abstraction_options(self) -> tuple[dict[str, Any], Sequence[str]]:
+        """Arguments of the gate, and what it keeps open."""
+        options = dict(self.causal_abstraction) if isinstance(self.causal_abstraction, dict) else {}
+        keep_open = options.pop("keep_open", ())
+        return options, keep_open
+
+    def _setup_abstraction(self) -> None:
+        self.relevance_gate = None
+        if self.causal_abstraction is False:
+            self._relevance_verdict = None
+            return
+        options, keep_open = self._abstraction_options()
+        check_keywords("causal_abstraction", options, RelevanceGate)
+        if isinstance(keep_open, str) or not isinstance(keep_open, Sequence):
+            raise ValueError(f"causal_abstraction: keep_open must be a list of names of states and actions, got {keep_open!r}")
+        variables = self.transition_variables
+        names = {*variables.state_names, *variables.action_names}
+        unknown = [name for name in keep_open if name not in names]
+        if unknown:
+            raise ValueError(f"causal_abstraction: keep_open must be names among {sorted(names)}, got {unknown}")
+        try:
+            gate = RelevanceGate(variables, **options)
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"causal_abstraction: {error}") from error
+        if self._relevance_verdict is not None:
+            # A loaded model goes on, with the arguments that it has now
+            saved = RelevanceGate.from_state_dict({**self._relevance_verdict, **gate.settings})
+            if saved.variables != variables:
+                raise ValueError(f"its relevance gate is of other variables: {saved.names}")
+            gate = saved
+        self.relevance_gate = gate
+
     def _setup_discovery(self) -> None:
         try:
             self.discovery = make_discovery(self.causal_discovery, **self.causal_discovery_kwargs)
         except (TypeError, ValueError) as error:
             raise ValueError(f"causal_discovery_kwargs: {error}") from error
         self.transition_variables = self._named_variables()
+        self._setup_abstraction()
         method = self.causal_discovery
         # A callable that was saved is not the same object when it is loaded
         name = method if isinstance(method, str) else getattr(method, "__qualname__", type(method).__qualname__)

@@ -76,6 +76,7 @@ def denoising_loss(
     rule: GuidanceRule | None = None,
     continuous: bool = False,
     weights: th.Tensor | None = None,
+    gate: th.Tensor | None = None,
 ) -> DenoisingTerms:
     """
     ``E || eps_theta(a^k, k, s) - eps_cg ||^2``: the noise really injected, shifted by the guidance (stop-gradient).
@@ -88,27 +89,37 @@ def denoising_loss(
     :param rule: How the guidance enters, needed with a guidance
     :param continuous: Whether times are drawn from all between the first and the last diffusion step, for samplers that take
         other steps than the schedule's (denoising score matching in continuous time, Song et al., 2021, equation 7)
+    :param gate: 0 for components of the actions that are not modelled, 1 for the others, shape ``(d,)``; None models all
     :param weights: Of the actions in the loss, like those of :func:`advantage_weights`, shape ``(batch, 1)``; None for equal
         ones
     :return: The loss, and what the same noise prediction says of the clean actions
     """
-    noisy, noise, step = _noised(schedule, actions, continuous)
+    noisy, noise, step = _noised(schedule, actions if gate is None else actions * gate, continuous, gate)
     predict_noise = bind(denoiser, features)
     predicted = predict_noise(noisy, step)
     clean_action = schedule.clean_estimate(noisy, predicted, step)
     if guidance is not None and rule is not None:
         noise = noise - guidance_shift(guidance, rule, predict_noise, schedule, noisy, predicted.detach(), step)
+    if gate is not None:
+        predicted, noise, clean_action = predicted * gate, noise * gate, clean_action * gate
     loss = F.mse_loss(predicted, noise) if weights is None else (weights * (predicted - noise).square()).mean()
-    return DenoisingTerms(loss, bounded(clean_action), outside(clean_action))
+    beyond = outside(clean_action)
+    if gate is not None:
+        # Means over the components that are modelled
+        share = gate.numel() / gate.sum().clamp(min=1.0)
+        loss, beyond = share * loss, share * beyond
+    return DenoisingTerms(loss, bounded(clean_action), beyond)
 
 
-def _noised(schedule: NoiseSchedule, actions: th.Tensor, continuous: bool) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
+def _noised(
+    schedule: NoiseSchedule, actions: th.Tensor, continuous: bool, gate: th.Tensor | None = None
+) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
     """Noisy actions, their noise and their diffusion steps, drawn anew."""
     if continuous:
         step = th.rand(len(actions), device=actions.device) * (schedule.n_steps - 1)
     else:
         step = th.randint(schedule.n_steps, (len(actions),), device=actions.device)
-    noise = th.randn_like(actions)
+    noise = th.randn_like(actions) if gate is None else th.randn_like(actions) * gate
     return schedule.add_noise(actions, noise, step), noise, step
 
 

@@ -58,8 +58,18 @@ def q_values(
     :param networks: Which of the networks, all by default
     :return: One tensor of shape ``(batch, 1)`` for each network
     """
-    inputs = th.cat([features, actions], dim=1)
+    inputs = th.cat([features, modelled(critic, actions)], dim=1)
     return [network(inputs) for network in critic.q_networks[networks]]
+
+
+def modelled(network: nn.Module, actions: th.Tensor) -> th.Tensor:
+    """
+    :param network: An actor or critics
+    :param actions: Shape ``(..., d)``
+    :return: The same with 0 for components that the network does not model, if it is one that hides any
+    """
+    gate = getattr(network, "action_gate", None)
+    return actions if gate is None else actions * gate
 
 
 class Critic(PickledAlone, ContinuousCritic):
@@ -69,14 +79,25 @@ class Critic(PickledAlone, ContinuousCritic):
     :param normalization: ``layer`` normalises hidden layers before their activation, ``batch`` the inputs of each layer over
         the batch, as in CrossQ; None for none
     :param value_network: Whether there is a network V(s) beside them
+    :param gates_actions: Whether components of actions can be hidden from it, by the buffer ``action_gate``
     :param kwargs: Keyword arguments of SB3's critics
     """
 
     BATCH_NORM_MOMENTUM = 0.01
     BATCH_NORM_EPSILON = 1e-3
 
-    def __init__(self, normalization: str | None = None, value_network: bool = False, **kwargs: Any) -> None:
+    action_gate: th.Tensor | None
+
+    def __init__(
+        self,
+        normalization: str | None = None,
+        value_network: bool = False,
+        gates_actions: bool = False,
+        **kwargs: Any,
+    ) -> None:
         super().__init__(**kwargs)
+        gate = th.ones(get_action_dim(kwargs["action_space"])) if gates_actions else None
+        self.register_buffer("action_gate", gate, persistent=False)
         n_inputs = kwargs["features_dim"] + get_action_dim(kwargs["action_space"])
         norms: dict[str, list[Any]] = {}
         if normalization == "layer":
@@ -98,6 +119,9 @@ class Critic(PickledAlone, ContinuousCritic):
             make_layers_fast(self.value_network)
         modules = (module for network in self.q_networks for module in network.modules())
         self._batch_norms = tuple(module for module in modules if isinstance(module, nn.BatchNorm1d))
+
+    def forward(self, obs: PyTorchObs, actions: th.Tensor) -> tuple[th.Tensor, ...]:
+        return super().forward(obs, modelled(self, actions))
 
     @property
     def normalizes_batches(self) -> bool:
@@ -178,7 +202,11 @@ class DiffusionActor(PickledAlone, BasePolicy):
     :param denoiser: Name or class of the denoiser, see :func:`~sb3_causalgdp.diffusion.make_denoiser`
     :param denoiser_kwargs: Further arguments of the denoiser
     :param one_pass: Whether the actions are those of a perceptron, which asks the denoiser nothing: it is trained beside it
+    :param gates_actions: Whether there can be components of actions that it does not model, which are then 0, by the buffer
+        ``action_gate``
     """
+
+    action_gate: th.Tensor | None
 
     # Noise's share of the variance from which an action is adapted to a state near by
     ADAPTING_NOISE = 0.1
@@ -201,6 +229,7 @@ class DiffusionActor(PickledAlone, BasePolicy):
         denoiser: str | type[nn.Module] = "mlp",
         denoiser_kwargs: dict[str, Any] | None = None,
         one_pass: bool = False,
+        gates_actions: bool = False,
     ) -> None:
         super().__init__(
             observation_space,
@@ -211,6 +240,7 @@ class DiffusionActor(PickledAlone, BasePolicy):
         )
         check_sampler(sampler, ddim_eta, sampling_steps)
         self.action_dim = get_action_dim(action_space)
+        self.register_buffer("action_gate", th.ones(self.action_dim) if gates_actions else None, persistent=False)
         self.net_arch = net_arch
         self.features_dim = features_dim
         self.activation_fn = activation_fn
@@ -252,6 +282,7 @@ class DiffusionActor(PickledAlone, BasePolicy):
             denoiser=self.denoiser_class,
             denoiser_kwargs=self.denoiser_kwargs,
             one_pass=self.one_pass is not None,
+            gates_actions=self.action_gate is not None,
         )
         return data
 
@@ -281,8 +312,13 @@ class DiffusionActor(PickledAlone, BasePolicy):
         :return: Actions in [-1, 1], shape ``(batch, d)``
         """
         if self.one_pass is not None:
-            return self.one_pass(features)
-        return sample(
+            return modelled(self, self.one_pass(features))
+        if self.action_gate is not None:
+            if noise is None:
+                shape = (self.n_noises, len(features), self.action_dim)
+                noise = th.randn(shape, dtype=features.dtype, device=features.device)
+            noise = modelled(self, noise)
+        action = sample(
             self.denoiser,
             self.schedule,
             features,
@@ -295,6 +331,8 @@ class DiffusionActor(PickledAlone, BasePolicy):
             n_steps=self.sampling_steps,
             divergences=divergences,
         )
+        # Guidance may have moved what is not modelled
+        return modelled(self, action)
 
     def adapt(self, features: th.Tensor, action: th.Tensor) -> th.Tensor:
         """
@@ -306,8 +344,9 @@ class DiffusionActor(PickledAlone, BasePolicy):
         :return: Actions in [-1, 1], shape ``(batch, d)``
         """
         step = th.full(action.shape[:1], self.adapting_step, device=action.device)
-        noisy = self.schedule.add_noise(action, th.zeros_like(action), step)
-        return self.schedule.clean_estimate(noisy, bind(self.denoiser, features)(noisy, step), step).clamp(-1.0, 1.0)
+        noisy = self.schedule.add_noise(modelled(self, action), th.zeros_like(action), step)
+        clean = self.schedule.clean_estimate(noisy, bind(self.denoiser, features)(noisy, step), step).clamp(-1.0, 1.0)
+        return modelled(self, clean)
 
     def forward(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         features = self.features(observation)

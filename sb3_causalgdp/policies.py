@@ -1,7 +1,7 @@
 """Networks of CausalGDP, what they are fed and how they are guided, as one SB3 policy."""
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -19,6 +19,7 @@ from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from stable_baselines3.common.vec_env import VecNormalize
 from torch import nn
 
+from sb3_causalgdp.abstraction import forget_inputs, forget_outputs
 from sb3_causalgdp.acceleration.acting import NumpyActing, OnePassActing
 from sb3_causalgdp.acceleration.activations import fast
 from sb3_causalgdp.arguments import POLICY_ARGUMENTS, check_arguments, check_keywords
@@ -92,6 +93,8 @@ class CausalGDPPolicy(SavedPolicy):
     :param one_pass: Whether a perceptron acts, trained beside the denoiser: one pass, no candidates and no steering while
         acting
     :param value_network: Whether the critics have a network V(s) beside them
+    :param causal_abstraction: Whether components of observations and actions can be hidden from actor and critics, see
+        :meth:`show`
     """
 
     actor: DiffusionActor
@@ -103,6 +106,8 @@ class CausalGDPPolicy(SavedPolicy):
     return_std: th.Tensor
     guidance_ready: th.Tensor
     candidate_noise: th.Tensor
+    state_gate: th.Tensor
+    action_gate: th.Tensor
 
     def __init__(
         self,
@@ -140,6 +145,7 @@ class CausalGDPPolicy(SavedPolicy):
         discount: float = 0.99,
         one_pass: bool = False,
         value_network: bool = False,
+        causal_abstraction: bool = False,
     ) -> None:
         check_arguments(POLICY_ARGUMENTS, locals())
         check_keywords("features_extractor_kwargs", features_extractor_kwargs or {}, features_extractor_class)
@@ -179,6 +185,7 @@ class CausalGDPPolicy(SavedPolicy):
         self.critic_normalization = critic_normalization
         self.normalize_observations = normalize_observations
         self.share_features_extractor = share_features_extractor
+        self.causal_abstraction = causal_abstraction
         self.world_model_net_arch = world_model_net_arch
         actor_arch, critic_arch = get_actor_critic_arch(self.net_arch)
         shared_kwargs = {
@@ -186,6 +193,7 @@ class CausalGDPPolicy(SavedPolicy):
             "action_space": action_space,
             "activation_fn": self.activation_fn,
             "normalize_images": normalize_images,
+            "gates_actions": causal_abstraction,
         }
         self.diffusion_kwargs = {
             "diffusion_steps": diffusion_steps,
@@ -221,6 +229,9 @@ class CausalGDPPolicy(SavedPolicy):
         self.register_buffer("reward_target", th.zeros(()))
         self.register_buffer("return_std", th.ones(()))
         self.register_buffer("guidance_ready", th.zeros(()))
+        if self.causal_abstraction:
+            self.register_buffer("state_gate", th.ones(sum(self.leaf_sizes)))
+            self.register_buffer("action_gate", th.ones(spaces.flatdim(self.action_space)))
         self.actor = self.make_actor()
         self.actor_target = self.make_actor()
         self.actor_target.load_state_dict(self.actor.state_dict())
@@ -296,22 +307,131 @@ class CausalGDPPolicy(SavedPolicy):
 
     def make_features_extractor(self) -> BaseFeaturesExtractor:
         extractor = super().make_features_extractor()
-        is_covered = self.normalize_observations and not self.has_image_state
-        if is_covered and StandardizedExtractor.covers(extractor, sum(self.leaf_sizes)):
-            return StandardizedExtractor(extractor).to(self.device)
+        is_covered = not self.has_image_state and StandardizedExtractor.covers(extractor, sum(self.leaf_sizes))
+        if self.causal_abstraction and not is_covered:
+            raise ValueError(
+                "causal_abstraction must be False with images or features of your own, got True: it hides components "
+                "of observations"
+            )
+        if is_covered and (self.normalize_observations or self.causal_abstraction):
+            return StandardizedExtractor(extractor, self.normalize_observations).to(self.device)
         return extractor
 
     @th.no_grad()
     def update_observation_statistics(self) -> None:
         """Let actor, critics and their targets see observations by what the world model knows of them by now."""
+        own = self._statistics_of_extractors()
+        if own and self.normalize_observations:
+            inverse_std = 1.0 / self.world_model.state_std
+            if self.causal_abstraction:
+                inverse_std *= self.state_gate
+            th._foreach_copy_(own, [self.world_model.state_mean, inverse_std] * (len(own) // 2))
+
+    def _statistics_of_extractors(self) -> list[th.Tensor]:
+        """Mean and factor of each network."""
         networks = (self.actor, self.actor_target, self.critic, self.critic_target)
         extractors = (network.features_extractor for network in networks)
-        own = [
+        return [
             tensor for one in extractors if isinstance(one, StandardizedExtractor) for tensor in (one.mean, one.inverse_std)
         ]
-        if own:
-            measured = [self.world_model.state_mean, 1.0 / self.world_model.state_std]
-            th._foreach_copy_(own, measured * (len(own) // 2))
+
+    # Causal abstraction -------------------------------------------------------------------------------------------------
+
+    @th.no_grad()
+    def show(self, states: th.Tensor, actions: th.Tensor) -> None:
+        """
+        Say what actor, critics and their targets see. Hidden components of observations are constant for them. Hidden ones of
+        actions are 0 in all that the actor gives and the critics are asked, before the exploration noise. What is shown again
+        starts with weights of 0, so that no output jumps. The world model sees everything always.
+
+        :param states: Which state variables are shown, boolean, shape ``(n,)``
+        :param actions: Which components of the actions are shown, boolean, shape ``(d,)``
+        :raises ValueError: If the policy was made without ``causal_abstraction``
+        """
+        if not self.causal_abstraction:
+            raise ValueError("causal_abstraction must be True for a policy that hides components of observations, got False")
+        states, actions = states.to(self.device, th.bool), actions.to(self.device, th.bool)
+        before, actions_before = self.state_gate > 0.0, self.action_gate > 0.0
+        if th.equal(states, before) and th.equal(actions, actions_before):
+            return
+        self._begin_anew(states & ~before, actions & ~actions_before, before, actions_before)
+        self._stop_modelling(~actions & actions_before)
+        self.state_gate.copy_(states)
+        self.action_gate.copy_(actions)
+        self._write_action_gates()
+        if self.normalize_observations:
+            self.update_observation_statistics()
+        else:
+            for factor in self._statistics_of_extractors()[1::2]:
+                factor.copy_(self.state_gate)
+
+    def _write_action_gates(self) -> None:
+        for network in (self.actor, self.actor_target, self.critic, self.critic_target):
+            assert network.action_gate is not None
+            network.action_gate.copy_(self.action_gate)
+
+    def _trained_networks(self) -> list[tuple[DiffusionActor | Critic, th.optim.Optimizer | None]]:
+        """Actor and critics, each with its optimizer, and their targets, which have none."""
+        networks = {network: network.optimizer for network in (self.actor, self.critic)}
+        return list({self.actor_target: None, self.critic_target: None, **networks}.items())  # type: ignore[arg-type]
+
+    def _begin_anew(self, states: th.Tensor, actions: th.Tensor, known: th.Tensor, known_actions: th.Tensor) -> None:
+        """Of inputs that are shown again, forget what was learned of them."""
+        mean, variance = th.zeros_like(self.world_model.state_mean), th.ones_like(self.world_model.state_mean)
+        if not self.normalize_observations:
+            mean, variance = self.world_model.state_mean, self.world_model.state_std.square()
+        # Actions are in [-1, 1]
+        unit = th.cat([mean, 0.0 * actions]), th.cat([variance, th.full_like(actions, 1.0 / 3.0, dtype=variance.dtype)])
+        inputs, known_inputs = th.cat([states, actions]), th.cat([known, known_actions])
+        for network, optimizer in self._trained_networks():
+            if isinstance(network, Critic):
+                for q_network in network.q_networks:
+                    forget_inputs(q_network, inputs, known_inputs, unit, optimizer)
+            else:
+                layer = network.denoiser.input_layer
+                times = th.zeros(layer.in_features - len(inputs), dtype=th.bool, device=self.device)
+                # Of noisy actions the weights are 0 since they were hidden
+                columns = th.cat([th.zeros_like(actions), times, states])
+                forget_inputs([layer], columns, th.cat([known_actions, ~times, known]), unit, optimizer)
+
+    def _stop_modelling(self, actions: th.Tensor) -> None:
+        """Let the denoisers neither see nor give components of actions."""
+        for network, optimizer in self._trained_networks():
+            if isinstance(network, DiffusionActor):
+                layer = network.denoiser.input_layer
+                last = [layer, *network.denoiser.network][-1]
+                assert isinstance(last, th.nn.Linear)
+                others = th.zeros(layer.in_features - len(actions), dtype=th.bool, device=self.device)
+                columns = th.cat([actions, others])
+                forget_inputs([layer], columns, ~columns, (columns, columns), optimizer)
+                forget_outputs(last, actions, optimizer)
+
+    def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False) -> Any:
+        """
+        As PyTorch's. What was hidden in a policy is shown again in one without ``causal_abstraction``, and one that has it
+        hides nothing yet after the parameters of one without.
+
+        :param state_dict: Tensors by name
+        :param strict: As PyTorch's
+        :param assign: As PyTorch's
+        :return: As PyTorch's
+        """
+        state_dict = dict(state_dict)
+        if self.causal_abstraction:
+            if strict:
+                gates = {"state_gate": self.state_gate, "action_gate": self.action_gate}
+                state_dict = {**{name: th.ones_like(gate) for name, gate in gates.items()}, **state_dict}
+            result = super().load_state_dict(state_dict, strict, assign)
+            self._write_action_gates()
+            return result
+        gates = [state_dict.pop(name, None) for name in ("state_gate", "action_gate")]
+        result = super().load_state_dict(state_dict, strict, assign)
+        if all(isinstance(gate, th.Tensor) for gate in gates):
+            shown, modelled = (gate.to(self.device) > 0.0 for gate in gates)
+            with th.no_grad():
+                self._begin_anew(~shown, ~modelled, shown, modelled)
+                self.update_observation_statistics()
+        return result
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         data = super()._get_constructor_parameters()
@@ -328,6 +448,7 @@ class CausalGDPPolicy(SavedPolicy):
             share_features_extractor=self.share_features_extractor,
             world_model_net_arch=self.world_model_net_arch,
             value_network=self.value_network,
+            causal_abstraction=self.causal_abstraction,
             lr_schedule=self._dummy_schedule,  # not needed for loading the policy alone
             **self.diffusion_kwargs,
             **self.guidance_kwargs,

@@ -334,9 +334,8 @@ class Updates:
         observations, of_data, weights, guidance = learned(transitions, next_actions, climbed, guided)
         features = actor.features(observations)
         rule = self.policy.guidance_rule if guided else None
-        denoising = denoising_loss(
-            actor.denoiser, actor.schedule, features, of_data, guidance, rule, actor.is_continuous, weights
-        )
+        how = (guidance, rule, actor.is_continuous, weights, actor.action_gate)
+        denoising = denoising_loss(actor.denoiser, actor.schedule, features, of_data, *how)
         if weights is not None:
             return denoising, th.zeros_like(denoising.loss)
         actions = denoising.clean_actions if update == "one_step" else actor.sample(features)

@@ -20,16 +20,16 @@ LAYERS = [
     {"export"},
     {"prediction", "acceleration.product_pass"},
     {"networks", "acceleration.acting"},
-    {"saving.policies", "acceleration.numpy_networks"},
+    {"saving.policies", "acceleration.numpy_networks", "abstraction"},
     {"arguments", "names", "saving.models"},
     {"causal.__main__"},
-    {"causal", "offline", "diffusion"},
+    {"causal", "offline", "diffusion", "stress"},
     {"causal.plots", "causal.sources", "causal.guidance"},
     {"causal.transitions", "causal.discovery", "causal.interventions"},
     {"causal.world_model", "causal.statistics"},
     {"causal.graph"},
     {"causal.rows"},
-    {"causal.answers", "causal.description"},
+    {"causal.answers", "causal.description", "causal.relevance"},
     {"causal.drawing", "causal.variables"},
     {"causal.edges", "sources", "lazy"},
     {
@@ -55,6 +55,7 @@ WITHOUT_SB3 = {
     "hints",
     "losses",
     "moved",
+    "stress",
     "acceleration.gradients",
     "acceleration.products",
     "acceleration.product_pass",
@@ -63,6 +64,7 @@ WITHOUT_SB3 = {
     "acceleration.fast_steps",
     "acceleration.numpy_networks",
     "acceleration.switch",
+    "abstraction",
 }
 LEVELS = {part: level for level, parts in enumerate(LAYERS) for part in parts}
 FILES = sorted(PACKAGE.rglob("*.py"))

@@ -96,6 +96,17 @@ def ours_estimate(graph: CausalGraph) -> Estimate:
     return Estimate(graph.masks, graph.masks, np.abs(graph.effects), True, graph.effects)
 
 
+def load_evidence() -> Fit:
+    """``partial_r2`` read by its evidence, the probability of an effect at all, in place of its masks."""
+
+    def fit(rows: np.ndarray, variables: TransitionVariables) -> Estimate:
+        graph = fit_ours("partial_r2", rows, variables)
+        assert graph.evidence is not None
+        return Estimate(graph.evidence, graph.evidence, np.abs(graph.effects), True, graph.effects)
+
+    return fit
+
+
 def standardise(rows: np.ndarray) -> np.ndarray:
     """
     :param rows: shape (N, p)
@@ -302,6 +313,7 @@ PEERS: dict[str, Callable[[], Fit]] = {
     "lingam": load_lingam,
     "lingam_prior": partial(load_lingam, with_prior=True),
     "correlation": load_correlation,
+    "partial_r2_evidence": load_evidence,
     "lasso": load_lasso,
     "lasso_cv": partial(load_lasso, cross_validated=True),
 }

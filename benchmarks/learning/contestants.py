@@ -7,7 +7,15 @@ from typing import Any
 import yaml
 
 PEERS = ("sac", "td3", "tqc", "crossq")
-NAMES = ("causalgdp", *PEERS)
+VARIANTS: dict[str, dict[str, Any]] = {
+    "causalgdp": {},
+    "causalgdp_open": {"causal_discovery": "fully_connected"},
+    "causalgdp_perturbed": {
+        "causal_discovery": "perturbed",
+        "causal_discovery_kwargs": {"method": "partial_r2", "noise": 0.5},
+    },
+}
+NAMES = (*VARIANTS, *PEERS)
 
 
 def make_model(algorithm: str, env: Any, seed: int, **arguments: Any) -> Any:
@@ -16,9 +24,11 @@ def make_model(algorithm: str, env: Any, seed: int, **arguments: Any) -> Any:
     :param env: The environments
     :param seed: Seed
     :param arguments: Of the constructor, on top of the settings
-    :return: The model: CausalGDP with its defaults, the others with RL Zoo's settings
+    :return: The model: CausalGDP with its defaults, or with a graph that says nothing or a wrong one, the others with RL Zoo's
+        settings
     """
-    settings = {} if algorithm == "causalgdp" else zoo_settings(algorithm, env.get_attr("spec")[0].id)
+    own = algorithm in VARIANTS
+    settings = dict(VARIANTS[algorithm]) if own else zoo_settings(algorithm, env.get_attr("spec")[0].id)
     noise_std = settings.pop("noise_std", None)
     if settings.pop("noise_type", None) == "normal":
         import numpy as np
@@ -39,7 +49,7 @@ def class_of(algorithm: str) -> Any:
 
     from sb3_causalgdp import CausalGDP
 
-    own = {"causalgdp": CausalGDP, "tqc": sb3_contrib.TQC, "crossq": sb3_contrib.CrossQ}
+    own = {**dict.fromkeys(VARIANTS, CausalGDP), "tqc": sb3_contrib.TQC, "crossq": sb3_contrib.CrossQ}
     return own.get(algorithm) or getattr(stable_baselines3, algorithm.upper())
 
 
@@ -54,6 +64,7 @@ def zoo_settings(algorithm: str, env_id: str) -> dict[str, Any]:
     assert spec is not None and spec.origin is not None
     path = Path(spec.origin).parent / "hyperparams" / f"{algorithm}.yml"
     entries = yaml.safe_load(path.read_text(encoding="utf-8"))
+    env_id = env_id.rpartition("/")[2]  # the namespace says what was put around the task
     entry = dict(entries.get(env_id.replace("-v5", "-v4")) or entries["HalfCheetah-v4"])
     entry.pop("n_timesteps")
     if isinstance(entry.get("policy_kwargs"), str):

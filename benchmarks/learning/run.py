@@ -48,10 +48,12 @@ class Run(NamedTuple):
     kwargs: dict[str, Any]
     folder: Path
     checkpoints: Path
+    env_kwargs: dict[str, Any]
 
     @property
     def title(self) -> str:
-        return f"{self.env}_{self.name}_{self.seed}"
+        # An id may name a module and a namespace, which are no part of a file's name
+        return f"{self.env.rpartition('/')[2]}_{self.name}_{self.seed}"
 
     @property
     def result(self) -> Path:
@@ -101,7 +103,7 @@ def train(run: Run) -> None:
         def __init__(self) -> None:
             super().__init__()
             # Episodes are evaluated side by side, one for each environment
-            self.env = make_vec_env(run.env, n_envs=run.episodes)
+            self.env = make_vec_env(run.env, n_envs=run.episodes, env_kwargs=run.env_kwargs)
             self.rows: list[tuple[float, ...]] = []
             self.spent = (0.0, 0.0)
             self._clock = Clock()
@@ -131,7 +133,7 @@ def train(run: Run) -> None:
             print(time.strftime("%H:%M"), run.title, *self.rows[-1], flush=True)
 
     checkpoints = run.checkpoints / run.title
-    training_env = make_vec_env(run.env, seed=run.seed)
+    training_env = make_vec_env(run.env, seed=run.seed, env_kwargs=run.env_kwargs)
     try:
         model = resume(class_of(run.algorithm), checkpoints, training_env, "cpu")
         print(f"{run.title} goes on after {model.num_timesteps} steps", flush=True)
@@ -156,6 +158,7 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument("--folder", type=Path, default=RESULTS)
     parser.add_argument("--checkpoints", type=Path, default=CHECKPOINTS)
     parser.add_argument("--kwargs", type=json.loads, default={}, help="arguments of the algorithm, as JSON")
+    parser.add_argument("--env-kwargs", type=json.loads, default={}, help="arguments of the environment, as JSON")
     parser.add_argument("--name", help="name of this variant in the results, the algorithm's own by default")
     parser.add_argument("--queue", type=Path, help="file with the arguments of one call in each line")
     parser.add_argument("--one", action="store_true", help=argparse.SUPPRESS)
@@ -176,6 +179,7 @@ def runs_of(arguments: argparse.Namespace) -> Iterator[Run]:
                 arguments.kwargs,
                 arguments.folder,
                 arguments.checkpoints,
+                arguments.env_kwargs,
             )
 
 
@@ -199,7 +203,7 @@ def launch(run: Run) -> bool:
         command = [sys.executable, __file__, "--one", "--env", run.env, "--steps", str(run.steps), "--name", run.name]
         command += ["--algorithms", run.algorithm, "--seeds", str(run.seed), "--eval-freq", str(run.eval_freq)]
         command += ["--episodes", str(run.episodes), "--folder", str(run.folder), "--checkpoints", str(run.checkpoints)]
-        command += ["--kwargs", json.dumps(run.kwargs)]
+        command += ["--kwargs", json.dumps(run.kwargs), "--env-kwargs", json.dumps(run.env_kwargs)]
         subprocess.run(command, check=True, env={**os.environ, "OMP_NUM_THREADS": "1"})
     return True
 

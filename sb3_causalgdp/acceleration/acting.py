@@ -68,7 +68,8 @@ class HostCopy:
         :return: All that acting reads of it
         """
         tensors = [tensor for module in _networks_of(policy) for tensor in (*module.parameters(), *module.buffers())]
-        return [*tensors, policy.return_std, policy.reward_target]
+        gates = [] if policy.actor.action_gate is None else [policy.actor.action_gate]
+        return [*tensors, policy.return_std, policy.reward_target, *gates]
 
     @th.no_grad()
     def refresh(self) -> None:
@@ -95,6 +96,8 @@ class NumpyActing:
         self.critics = Critics(near)
         self.world_model = WorldModel(near.world_model)
         self.return_std, self.reward_target = view(near.return_std), view(near.reward_target)
+        gate = near.actor.action_gate
+        self.action_gate = None if gate is None else view(gate)
         rule = policy.guidance_rule
         points = sampling_points(policy.actor.schedule, policy.actor.sampling_steps)
         self.rule = None if rule is None else Rule(rule, points, policy.actor.action_dim)
@@ -161,7 +164,7 @@ class NumpyActing:
         features = self.features(state.T)
         time_part = self.denoiser.time_part()
         bound = self.denoiser.bind(features, self.denoiser.at_points(time_part))
-        noise = noise.transpose(0, 2, 1)
+        noise = (noise if self.action_gate is None else noise * self.action_gate).transpose(0, 2, 1)
         repeated = bound if n_candidates == 1 else np.repeat(bound, n_candidates, axis=2)
         start, scaled_noise = noise[0], self.denoiser.scaled(noise)
         first_prediction = self.denoiser.predict(start, repeated[-1])
@@ -175,7 +178,7 @@ class NumpyActing:
             assert self.rule is not None
             shift = self.rule.shift(action, *self._local_model(policy, state, action, time_part))
             action = self.denoiser.sample(bound, start, scaled_noise, first_prediction, shift).T
-        return np.ascontiguousarray(action)
+        return np.ascontiguousarray(action if self.action_gate is None else action * self.action_gate)
 
     def _local_model(
         self, policy: Policy, state: np.ndarray, action: np.ndarray, time_part: np.ndarray
@@ -239,6 +242,7 @@ class OnePassActing:
         return (
             switch.is_on()
             and policy.device.type == "cpu"
+            and policy.actor.action_gate is None
             and type(policy.observation_space) is spaces.Box
             and not policy.has_image_state
             and _shows_vectors(policy.actor.features_extractor)

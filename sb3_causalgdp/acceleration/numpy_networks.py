@@ -310,7 +310,7 @@ class Features:
         self.is_plain = not isinstance(extractor, StandardizedExtractor)
         if not self.is_plain:
             self.mean, self.inverse_std = view(extractor.mean)[:, None], view(extractor.inverse_std)[:, None]
-            self.bounds = _constant(-extractor.BOUND), _constant(extractor.BOUND)
+            self.bounds = _constant(-extractor.bound), _constant(extractor.bound)
 
     def __call__(self, state: np.ndarray) -> np.ndarray:
         if self.is_plain:

@@ -14,7 +14,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.type_aliases import PyTorchObs
 
 from sb3_causalgdp.callbacks.diagnostics import choice, guidance_divergence, step_size_bound
-from sb3_causalgdp.causal import min_rows
+from sb3_causalgdp.causal import Verdict, min_rows
 from sb3_causalgdp.causal.description import count_of_edges
 
 
@@ -94,6 +94,9 @@ class CausalWorldModelCallback(BaseCallback):
         graph = model.discovery(statistics, variables, model._causal_graph)
         graph = replace(graph, num_timesteps=int(model.n_environment_steps))
         model.set_causal_graph(graph)
+        verdict = model.judge_relevance(graph)
+        if verdict is not None:
+            self._report_verdict(verdict)
         self.logger.record("causal/n_edges", graph.n_edges)
         self.logger.record("causal/expected_edges", graph.expected_edges)
         self.logger.record("causal/change", graph.change_since(before))
@@ -101,6 +104,14 @@ class CausalWorldModelCallback(BaseCallback):
         if self.verbose >= 1:
             print(f"Causal graph at {model.num_timesteps} steps: {count_of_edges(graph)}, from {graph.n_samples} transitions")
         self._log_diagnostics()
+
+    def _report_verdict(self, verdict: Verdict) -> None:
+        self.logger.record("causal/n_closed_states", int((~verdict.states).sum()))
+        self.logger.record("causal/n_closed_actions", int((~verdict.actions).sum()))
+        if self.verbose >= 1:
+            changes = [("hides", verdict.closed), ("shows", verdict.opened)]
+            words = [f"{verb} {', '.join(names)}" for verb, names in changes if names]
+            print("Causal abstraction: " + ("; ".join(words) or verdict.withheld or "as before"))
 
     def _say_too_few(self, n_samples: int, needed: int) -> None:
         if not self._said_too_few:

@@ -24,6 +24,8 @@ if TYPE_CHECKING:
         StructuralModel,
         Trajectory,
     )
+    from sb3_causalgdp.causal.relevance import Relevance
+    from sb3_causalgdp.causal.relevance_gate import RelevanceGate, Verdict
     from sb3_causalgdp.causal.statistics.moments import StreamingMoments
     from sb3_causalgdp.causal.variables import TransitionVariables
     from sb3_causalgdp.causal.world_model import MaskedWorldModel
@@ -51,6 +53,9 @@ __getattr__, __dir__ = lazy_names(
                 *("InterventionalDistribution", "StructuralModel", "Trajectory"),
             )
         },
+        "Relevance": "sb3_causalgdp.causal.relevance",
+        "RelevanceGate": "sb3_causalgdp.causal.relevance_gate",
+        "Verdict": "sb3_causalgdp.causal.relevance_gate",
         "StreamingMoments": "sb3_causalgdp.causal.statistics.moments",
         "TransitionVariables": "sb3_causalgdp.causal.variables",
         "MaskedWorldModel": "sb3_causalgdp.causal.world_model",
@@ -68,6 +73,8 @@ __all__ = [
     "InterventionalDistribution",
     "LinearisedGuidance",
     "MaskedWorldModel",
+    "Relevance",
+    "RelevanceGate",
     "ReturnTarget",
     "RewardTarget",
     "Statistics",
@@ -75,6 +82,7 @@ __all__ = [
     "StructuralModel",
     "Trajectory",
     "TransitionVariables",
+    "Verdict",
     "discover",
     "make_discovery",
     "make_statistics",

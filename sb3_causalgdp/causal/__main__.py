@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from sb3_causalgdp.causal.transitions import TransitionSource
 
 # Its help is there at once: what takes time to import (PyTorch, gymnasium) is imported where it is used
-METHODS = ("direct_lingam", "notears", "partial_r2", "perturbed", "world_model")
+METHODS = ("direct_lingam", "fully_connected", "notears", "partial_r2", "perturbed", "world_model")
 BATCH_ROWS = 4096
 SHOWN_EDGES = 40
 SHOWN_VALUES = 8
@@ -57,6 +57,9 @@ def make_parser() -> argparse.ArgumentParser:
     add("--method", default="partial_r2", help=f"discovery method, one of {', '.join(METHODS)} (%(default)s)")
     add(
         "--method-kwargs", nargs="+", default=[], metavar="KEY=VALUE", help="arguments of the method, or a JSON object of them"
+    )
+    add(
+        "--relevance", action="store_true", help="how surely each variable can matter for any future reward, and by which path"
     )
     add("--plot", metavar="FILE", help="image to draw, such as graph.png")
     add(
@@ -164,6 +167,8 @@ def run(arguments: argparse.Namespace) -> None:
         graph.save(arguments.json)
     if not arguments.quiet:
         print(summary_of(graph, source))
+        if arguments.relevance:
+            print(relevance_summary(graph))
         print(f"time: {found - start:.1f} s ({read - start:.1f} s reading, {found - read:.1f} s discovery)")
     for warning in caught:
         print(f"warning: {warning.message}", file=sys.stderr)
@@ -330,6 +335,24 @@ def summary_of(graph: "CausalGraph", source: "TransitionSource") -> str:
         lines.append(f"linearly dependent, share their masks: {_shortened(groups)}")
     lines += [f"remark: {remark}" for remark in graph.remarks]
     return "\n".join(lines)
+
+
+def relevance_summary(graph: "CausalGraph") -> str:
+    """
+    :param graph: The graph
+    :return: relevance and surest path of each state and action, in lines for a terminal
+    """
+    from sb3_causalgdp.causal.relevance import ASSUMPTION
+
+    relevance = graph.relevance()
+    rows = relevance.rows()
+    shown, rest = rows[:SHOWN_EDGES], rows[SHOWN_EDGES:]
+    width = max(len(name) for name, *_ in shown)
+    lines = ["relevance for any future reward, and the surest path:"]
+    lines += [f"  {value:.2f}  {name:>{width}}  {path or '-'}" for name, value, _, path in shown]
+    if rest:
+        lines.append(f"  and {len(rest)} more, of at most {rest[0][1]:.2f}")
+    return "\n".join([*lines, ASSUMPTION])
 
 
 def _edge_lines(graph: "CausalGraph") -> list[str]:

@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.figure import Figure
 
+    from sb3_causalgdp.causal.relevance import Relevance
+
 __all__ = ["EDGE_PROBABILITY", "PLOTS_HINT", "CausalGraph", "Edge", "GraphDiff"]
 
 
@@ -45,6 +47,11 @@ class CausalGraph:
     :param r_squared: Share of each row's variance that its causes explain, shape (n + 1,), or None
     :param action_vif: Variance inflation factor of each action: how well the states and the other actions predict it, shape
         (d,), or None; where it is large, the behaviour policy confounds the action with the states
+    :param evidence: Probability of each edge that there is an effect at all, however weak, in [0, 1], shape (n + 1, n + d);
+        None where the method makes no such test
+    :param detectable_r2: Smallest partial R^2 of an effect on each row that the evidence would have shown, shape (n + 1,), or
+        None
+    :param state_vif: Variance inflation factor of each state among states and actions, shape (n,), or None
     :param constant_variables: Names of the variables that never moved; they have no edges
     :param duplicated_variables: Groups of names that are linear functions of each other; a group shares its masks
     :param num_timesteps: Environment steps when it was found
@@ -62,6 +69,9 @@ class CausalGraph:
     standard_errors: np.ndarray | None = None
     r_squared: np.ndarray | None = None
     action_vif: np.ndarray | None = None
+    evidence: np.ndarray | None = None
+    detectable_r2: np.ndarray | None = None
+    state_vif: np.ndarray | None = None
     constant_variables: tuple[str, ...] = ()
     duplicated_variables: tuple[tuple[str, ...], ...] = ()
     num_timesteps: int | None = None
@@ -73,9 +83,14 @@ class CausalGraph:
         matrix = (n_states + 1, n_states + n_actions)
         self.masks = _checked("masks", self.masks, matrix)
         self.effects = _checked("effects", self.effects, matrix)
-        for name, shape in (("standard_errors", matrix), ("r_squared", matrix[:1]), ("action_vif", (n_actions,))):
+        row: tuple[int, ...] = matrix[:1]
+        optional: dict[str, tuple[int, ...]] = {"standard_errors": matrix, "evidence": matrix}
+        optional |= {"r_squared": row, "detectable_r2": row, "action_vif": (n_actions,), "state_vif": (n_states,)}
+        for name, shape in optional.items():
             if getattr(self, name) is not None:
                 setattr(self, name, _checked(name, getattr(self, name), shape))
+        if self.evidence is not None and (self.evidence.min() < 0 or self.evidence.max() > 1):
+            raise ValueError(f"evidence must lie in [0, 1], got {self.evidence.min():g} to {self.evidence.max():g}")
         if self.masks.min() < 0 or self.masks.max() > 1:
             raise ValueError(f"masks must lie in [0, 1], got values from {self.masks.min():g} to {self.masks.max():g}")
         if self.standard_errors is not None and self.standard_errors.min() < 0:
@@ -287,6 +302,17 @@ class CausalGraph:
             standard_error=float("nan") if errors is None else float(errors[row, column]),
         )
 
+    def relevance(self) -> "Relevance":
+        """
+        How surely each state and action can matter for any future reward, and by which path; see
+        :func:`~sb3_causalgdp.causal.relevance.relevance_of`, which says what it assumes.
+
+        :return: with ``states``, shape (n,), and ``actions``, shape (d,), in [0, 1], in the order of the variables
+        """
+        from sb3_causalgdp.causal.relevance import relevance_of
+
+        return relevance_of(self)
+
     def to_dataframe(self) -> "pd.DataFrame":
         """
         :return: a row for each pair of variables that time allows, open or closed, in the order of ``edges``; the columns are
@@ -337,7 +363,8 @@ class CausalGraph:
             raise ValueError(f"text is not JSON: {error}") from error
         if not isinstance(content, dict):
             raise ValueError(f"text is not a causal graph: it holds a {type(content).__name__}, not an object")
-        content.setdefault("remarks", ())  # files of earlier versions have none
+        for name, value in (("remarks", ()), ("evidence", None), ("detectable_r2", None), ("state_vif", None)):
+            content.setdefault(name, value)  # files of earlier versions have none
         expected = {f.name for f in fields(cls)}
         if set(content) != expected:
             missing, unknown = sorted(expected - set(content)), sorted(set(content) - expected)

@@ -19,6 +19,7 @@ from sb3_causalgdp.causal import CausalGraph
 from sb3_causalgdp.causal.description import count_of_edges
 from sb3_causalgdp.causal.edges import GraphDiff
 from sb3_causalgdp.causal.plots import plot_causal_graph, plot_history
+from sb3_causalgdp.causal.relevance import ASSUMPTION
 from sb3_causalgdp.offline.saved_buffers import SUFFIXES, read_buffer
 from sb3_causalgdp.saving.archives import existing
 from sb3_causalgdp.zoo.hyperparameters import constructor_arguments
@@ -285,9 +286,20 @@ def _graph_section(model: CausalGDP) -> Section:
             rows[:MOST_EDGES],
             f"The {min(MOST_EDGES, len(rows))} strongest of {len(rows)} edges",
             folded=True,
-        )
+        ),
+        _relevance_table(graph),
     ]
     return Section(title, remarks, pictures, tables=tables)
+
+
+def _relevance_table(graph: CausalGraph) -> Table:
+    rows = graph.relevance().rows()
+    return Table(
+        ("variable", "relevance", "edges", "surest path"),
+        [(name, f"{value:.2f}", str(length or "-"), path or "-") for name, value, length, path in rows[:MOST_EDGES]],
+        f"What can matter for any future reward: {min(MOST_EDGES, len(rows))} of {len(rows)} variables. {ASSUMPTION}",
+        folded=True,
+    )
 
 
 def _history_section(run: RunFolder, model: CausalGDP) -> Section:

@@ -74,7 +74,9 @@ def test_the_value_of_a_choice_is_that_of_the_actions_that_are_taken(observation
     policy.guidance_rule = None
     unguided = choice(policy, observations)
     assert unguided.guidance_advantage == 0.0
-    assert found.guidance_advantage == pytest.approx(found.q_value - unguided.q_value, abs=1e-6) and found.guidance_advantage != 0
+    assert (
+        found.guidance_advantage == pytest.approx(found.q_value - unguided.q_value, abs=1e-6) and found.guidance_advantage != 0
+    )
     assert found.candidate_spread == unguided.candidate_spread > 0.0
     alone = make_policy(n_action_candidates=1)
     alone.set_training_mode(False)

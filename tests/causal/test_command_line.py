@@ -348,7 +348,10 @@ def test_kwargs():
 
 def test_mistakes_in_the_arguments(arrays, capsys):
     for options, message in (
-        (["--method", "magic"], "unknown discovery method 'magic', known are ['direct_lingam', 'notears', 'partial_r2'"),
+        (
+            ["--method", "magic"],
+            "unknown discovery method 'magic', known are ['direct_lingam', 'fully_connected', 'notears', 'partial_r2'",
+        ),
         (["--method-kwargs", "sparsity=1"], "unknown arguments ['sparsity'] for discovery method 'partial_r2'"),
         (["--method-kwargs", "threshold=2"], "threshold must be in (0, 1), got 2"),
         (["--method-kwargs", "threshold=low"], "--method-kwargs: "),

@@ -176,6 +176,7 @@ def test_it_says_what_the_run_was(full_page):
     assert "Pendulum-v1.zip (final), 300 environment steps" in summary
     assert "6 episodes" in summary and "from 239 transitions" in summary
     assert "Found after 240 environment steps by partial_r2 from 239 transitions" in full_page.text("Causal graph")
+    assert "What can matter for any future reward: 4 of 4 variables" in full_page.text("Causal graph")
     assert "what changed from step 120 to step 240" in full_page.text("History of the graph")
     assert "opened (1): cos angle -> cos angle'" in full_page.text("History of the graph")
     assert "300 transitions drawn from replay_buffer.pkl" in full_page.text("Effects of the actions")

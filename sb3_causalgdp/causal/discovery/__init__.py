@@ -8,6 +8,7 @@ from typing import Any, Protocol, overload
 
 import numpy.typing as npt
 
+from sb3_causalgdp.causal.discovery.fully_connected import FullyConnected
 from sb3_causalgdp.causal.discovery.lingam import DirectLingam
 from sb3_causalgdp.causal.discovery.notears import Notears
 from sb3_causalgdp.causal.discovery.partial_r2 import PartialR2
@@ -22,6 +23,7 @@ __all__ = [
     "DISCOVERY_METHODS",
     "DirectLingam",
     "DiscoveryMethod",
+    "FullyConnected",
     "Notears",
     "PartialR2",
     "Perturbed",
@@ -57,6 +59,7 @@ class DiscoveryMethod(Protocol):
 
 DISCOVERY_METHODS: dict[str, type] = {
     "direct_lingam": DirectLingam,
+    "fully_connected": FullyConnected,
     "notears": Notears,
     "partial_r2": PartialR2,
     "perturbed": Perturbed,

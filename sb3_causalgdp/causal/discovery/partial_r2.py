@@ -4,9 +4,10 @@ from typing import NamedTuple
 import numpy as np
 import torch as th
 from scipy.linalg import cho_solve
+from scipy.special import expit, ndtri
 
 from sb3_causalgdp.causal.graph import CausalGraph
-from sb3_causalgdp.causal.statistics.basis import BASES, BasisExpansion, BasisMoments, bytes_needed
+from sb3_causalgdp.causal.statistics.basis import BASES, N_FUNCTIONS, BasisExpansion, BasisMoments, bytes_needed
 from sb3_causalgdp.causal.statistics.degenerate import Degeneracy, LimitsFinder
 from sb3_causalgdp.causal.statistics.grouped import GroupedStatistics
 from sb3_causalgdp.causal.statistics.jackknife import jackknife_error
@@ -21,6 +22,8 @@ SMALLEST_RESIDUAL = 1e-9  # of the target's variance: what float32 rounding and 
 SMALLEST_DEVIATION = 1e-9  # in units of the standard deviation of all rows: below it, a column does not move in these rows
 FLOOR_SHARE = 1.0 / 30.0  # of the threshold: below it, the noise of the logarithm says nothing
 THINNING = 8
+FAMILY_ERROR = 0.01  # expected number of edges, of all possible ones, that evidence of one half gives where there are none
+POWER = 0.8  # with which an effect of ``detectable_r2`` has evidence of at least one half
 CHANGES_AT_ONCE = 2**18  # so that they stay in the processor's cache
 
 
@@ -41,6 +44,48 @@ def edge_probability(partial_r2: np.ndarray, log_error: np.ndarray, threshold: f
     return np.where(present & (probability >= 1e-3), probability, 0.0)
 
 
+def edge_evidence(f_statistic: np.ndarray, n_features: np.ndarray | float, freedom: float, n_tests: int) -> np.ndarray:
+    """
+    Probability that there is an edge at all, however weak: ``1 / (1 + exp[(z0^2 - z^2) / 2])``, with z the F-test's statistic
+    as a standard normal variable (Wilson and Hilferty's cube roots), and z0 what 1 in 100 whole graphs without any edge exceed
+    somewhere (Bonferroni).
+
+    :param f_statistic: At least 0, any shape
+    :param n_features: Degrees of freedom of its numerator, at least 1, of a shape that goes with it
+    :param freedom: Degrees of freedom of its denominator
+    :param n_tests: Number of edges that are tested
+    :return: the shape of ``f_statistic``; exactly 0 below 1e-3
+    """
+    z = np.maximum(_as_normal(f_statistic, n_features, freedom), 0.0)
+    evidence = expit(0.5 * (z**2 - _z_of_one_half(n_tests) ** 2))
+    return np.where(evidence >= 1e-3, evidence, 0.0)
+
+
+def _z_of_one_half(n_tests: int) -> float:
+    return float(-ndtri(FAMILY_ERROR / n_tests))
+
+
+def _as_normal(f_statistic: np.ndarray, n_features: np.ndarray | float, freedom: float) -> np.ndarray:
+    of_cause, of_rest = 2.0 / (9.0 * n_features), 2.0 / (9.0 * freedom)
+    root = np.cbrt(f_statistic)
+    return (root * (1.0 - of_rest) - (1.0 - of_cause)) / np.sqrt(of_cause + of_rest * root**2)
+
+
+def detectable_effect(n_features: float, freedom: float, design_effect: np.ndarray, n_tests: int) -> np.ndarray:
+    """
+    :param n_features: Degrees of freedom of the F-test's numerator
+    :param freedom: Degrees of freedom of its denominator
+    :param design_effect: How much more the statistic spreads than that of independent rows, at least 1, any shape
+    :param n_tests: Number of edges that are tested
+    :return: partial R^2 whose evidence is at least one half in four of five samples, the same shape
+    """
+    of_cause = 2.0 / (9.0 * n_features)
+    critical = n_features * (1.0 - of_cause + _z_of_one_half(n_tests) * np.sqrt(of_cause)) ** 3
+    # The root of a noncentral chi^2 is about normal, with variance 1
+    ratio = design_effect * ((np.sqrt(critical) + ndtri(POWER)) ** 2 - (n_features - 1.0)) / freedom
+    return ratio / (1.0 + ratio)
+
+
 class PartialR2:
     """
     Nonlinear discovery: how much of what the other causes leave does each cause explain?
@@ -55,6 +100,12 @@ class PartialR2:
     logarithm by a jackknife that leaves out blocks of rows (Busing, Meijer and van der Leeden, 1999). Each estimate without a
     block is one Newton step from the solution, which makes the errors those of cluster-robust inference (Cameron and Miller,
     2015, "A practitioner's guide to cluster-robust inference").
+
+    Evidence is another probability: that of an effect at all, however weak. It comes from F-tests of the same features (where
+    there are products, no larger than the mask), of those that are functions of the cause alone and of the one that is linear
+    in it, corrected for the number of tests and for rows that depend on each other: by the factor by which the sums of
+    features times residuals over blocks of rows vary more than those of independent rows (the design effect of cluster
+    sampling, Kish, 1965).
 
     An effect is the difference of the target, in its standard deviations, when a cause moves from half a standard deviation
     below to half a one above, the others as they are: its size is the mean of the absolute difference over the newest 256
@@ -143,25 +194,28 @@ class PartialR2:
             return statistics.spread_out(self(statistics.statistics, statistics.group_variables))
         statistics = self._checked(statistics, variables)
         limits = self._find_limits(statistics.raw.correlation(), variables)
+        n_tests = (variables.n_states + 1) * (variables.n_states + variables.n_actions)
         rows = [
-            self._estimate(_dynamics(statistics, limits.of_dynamics)),
-            self._estimate(_reward(statistics, limits.of_reward)),
+            self._estimate(_dynamics(statistics, limits.of_dynamics), n_tests),
+            self._estimate(_reward(statistics, limits.of_reward), n_tests),
         ]
-        masks, effects, errors, r_squared = (np.concatenate(parts) for parts in zip(*rows, strict=True))
+        masks, effects, errors, r_squared, evidence, detectable = (np.concatenate(parts) for parts in zip(*rows, strict=True))
         return CausalGraph(
             variables,
             masks=masks,
             effects=effects,
             standard_errors=errors,
             r_squared=r_squared,
+            evidence=evidence,
+            detectable_r2=detectable,
             method="partial_r2",
             n_samples=statistics.dynamics.n_samples,
             remarks=(statistics.remark,) if statistics.remark else (),
             **limits.remarks(),
         )
 
-    def _estimate(self, regression: "_Regression") -> tuple[np.ndarray, ...]:
-        """Masks, effects and standard errors of the effects, each of shape (m, p), and R^2."""
+    def _estimate(self, regression: "_Regression", n_tests: int) -> tuple[np.ndarray, ...]:
+        """Masks, effects, their standard errors, each of shape (m, p), R^2, evidence, shape (m, p), and what it could see."""
         whole = regression.whole
         logs, effects, shares = [], [], []
         for part, share in regression.parts():
@@ -170,7 +224,9 @@ class PartialR2:
             shares.append(share)
         log_error = jackknife_error(self._log(whole), logs, shares)
         masks = edge_probability(whole.partial_r2, log_error, self.threshold, self.spread)
-        return masks.T, whole.effects.T, jackknife_error(whole.effects, effects, shares).T, regression.r_squared()
+        effect_errors = jackknife_error(whole.effects, effects, shares).T
+        evidence, detectable = regression.evidence(n_tests, masks)
+        return masks.T, whole.effects.T, effect_errors, regression.r_squared(), evidence.T, detectable
 
     def _log(self, estimates: "_Estimates") -> np.ndarray:
         return th.from_numpy(estimates.partial_r2).clamp(min=FLOOR_SHARE * self.threshold).log().numpy()
@@ -204,12 +260,15 @@ class _Tests(NamedTuple):
     :param n_features: Number of features that are left out and in use, shape (q, 1)
     :param features: Indices of the features that are left out, shape (q, g)
     :param spread: Covariance of these features given all others, ``[(S^-1)_GG]^-1``, shape (q, g, g)
+    :param spreads_behind: By a number of first features, the same of all others: of those behind the linear one, and of the
+        products; empty for groups and single features
     """
 
     causes: np.ndarray
     n_features: np.ndarray
     features: th.Tensor
     spread: th.Tensor
+    spreads_behind: dict[int, th.Tensor]
 
 
 class _Fit(NamedTuple):
@@ -295,6 +354,8 @@ class _Regression:
         self.features_of_kept = th.from_numpy(features_of_kept)
         self.slopes, self.mean_slopes = self._slopes(statistics, expansion, inputs, 0.5 * deviation[inputs] / expansion.scale)
         self.whole = self._estimates(self.fit)
+        self.design_effect = np.ones(self.shape[1])
+        """Of each target; known after ``parts``."""
 
     def r_squared(self) -> np.ndarray:
         """
@@ -314,6 +375,7 @@ class _Regression:
             scores[:, i] = self._scores(block)
         # At the minimum all gradients add up to nothing
         np.negative(scores[:, :-1].sum(axis=1), out=scores[:, -1])
+        self.design_effect = self._design_effect(scores)
         squares = [self._squares(block, scores[:, i]) for i, block in enumerate(self.blocks)]
         # One product for all blocks: each alone would read the whole inverse
         steps = symmetric_product(self.inverse, scores.reshape(self.n_features, -1)).reshape(scores.shape)
@@ -321,6 +383,38 @@ class _Regression:
         for i, (block, rest) in enumerate(zip(self.blocks, leave_one_out(self.blocks), strict=True)):
             residual = np.sum(squares[:i] + squares[i + 1 :], axis=0) / rest.count
             yield self._estimates(self._step(steps[:, i], residual, rest)), block.count / self.total.count
+
+    def evidence(self, n_tests: int, masks: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """
+        :param n_tests: Number of edges that are tested in the whole graph
+        :param masks: Of the edges, shape (p, m)
+        :return: evidence for the edges, shape (p, m), and the partial R^2 that it could see, shape (m,)
+        """
+        evidence, unit = np.zeros(self.shape), self.freedom / (self.fit.residual * self.design_effect)
+        for test in self.tests:
+            explained = self._explained(self.fit, test.features, test.spread).numpy()
+            found = edge_evidence(explained * unit / test.n_features, test.n_features, self.freedom, 3 * n_tests)
+            if test.spreads_behind and test.features.shape[1] > N_FUNCTIONS:
+                # Products are largest where residuals are, too, for which an F-test makes no allowance
+                found = np.minimum(found, masks[test.causes])
+            for n_first, spread in test.spreads_behind.items():
+                # A few features are seen with fewer rows than all
+                behind = self._explained(self.fit, test.features[:, n_first:], spread).numpy()
+                n_used = self.used[test.features.numpy()[:, :n_first]].sum(axis=1, keepdims=True)
+                ratio = np.maximum(explained - behind, 0.0) * unit / n_used
+                found = np.maximum(found, edge_evidence(ratio, n_used, self.freedom, 3 * n_tests))
+            evidence[test.causes] = found
+        for group in self.degeneracy.groups:
+            evidence[list(group)] = evidence[group[0]]
+        return evidence, detectable_effect(1.0, self.freedom, self.design_effect, 3 * n_tests)
+
+    def _design_effect(self, scores: np.ndarray) -> np.ndarray:
+        """From the blocks' scores, shape (F, blocks, m): at least 1, shape (m,)."""
+        shares = np.array([block.count for block in self.blocks]) / self.total.count
+        n_moving = max(int(np.count_nonzero(self.inverse_scale)), 1)
+        residual = self.fit.residual * self.total.count / self.freedom
+        independent = n_moving * residual * self.total.count * float(np.sum(shares * (1.0 - shares)))
+        return np.maximum(np.einsum("ijk,ijk->k", scores, scores) / independent, 1.0)
 
     def _factor(self, total: Moments) -> np.ndarray:
         """Cholesky factor of the features' second moments S, in units of their standard deviations; takes the place of
@@ -352,20 +446,23 @@ class _Regression:
 
     def _tests(self, features_of_kept: np.ndarray) -> list[_Tests]:
         in_group = {member for group in self.degeneracy.groups for member in group}
-        left_out: dict[int, list[tuple[int, np.ndarray]]] = {}
+        left_out: dict[tuple[int, bool], list[tuple[int, np.ndarray]]] = {}
         for cause, features in zip(self.degeneracy.kept.tolist(), features_of_kept, strict=True):
             if cause not in in_group:
-                left_out.setdefault(len(features), []).append((cause, features))
+                left_out.setdefault((len(features), False), []).append((cause, features))
         for group in self.degeneracy.groups:
             features = np.unique(features_of_kept[np.isin(self.degeneracy.kept, group)])
-            left_out.setdefault(len(features), []).append((group[0], features))
+            left_out.setdefault((len(features), True), []).append((group[0], features))
         tests = []
-        for together in left_out.values():
+        for (n_features, of_groups), together in left_out.items():
             causes, indices = (np.array(part) for part in zip(*together, strict=True))
             row, column = indices[:, :, None], indices[:, None, :]
             of_features = self.inverse[np.maximum(row, column), np.minimum(row, column)]
             spread = th.linalg.inv(th.from_numpy(of_features))
-            tests.append(_Tests(causes, self.used[indices].sum(axis=1, keepdims=True), th.from_numpy(indices), spread))
+            firsts = [] if of_groups else [n_first for n_first in (1, N_FUNCTIONS) if n_first < n_features]
+            behind = {n: th.linalg.inv(th.from_numpy(np.ascontiguousarray(of_features[:, n:, n:]))) for n in firsts}
+            n_used = self.used[indices].sum(axis=1, keepdims=True)
+            tests.append(_Tests(causes, n_used, th.from_numpy(indices), spread, behind))
         return tests
 
     def _slopes(
@@ -448,16 +545,20 @@ class _Regression:
 
     def _partial_r2(self, fit: _Fit) -> np.ndarray:
         partial = np.zeros(self.shape)
-        for causes, n_features, features, spread in self.tests:
-            left_out = fit.coefficients[features]
-            # Products of single numbers in a batch are slow
-            explained = left_out * (spread @ left_out if features.shape[1] > 1 else spread * left_out)
+        for causes, n_features, features, spread, _ in self.tests:
             # Variances instead of sums of squares, as in the adjusted R^2, so that a null edge has 0 on average
-            without = _summed(explained).numpy() + fit.residual
+            without = self._explained(fit, features, spread).numpy() + fit.residual
             partial[causes] = np.maximum(1.0 - fit.residual * (1.0 + n_features / self.freedom) / without, 0.0)
         for group in self.degeneracy.groups:
             partial[list(group)] = partial[group[0]]
         return partial
+
+    @staticmethod
+    def _explained(fit: _Fit, features: th.Tensor, spread: th.Tensor) -> th.Tensor:
+        """How much the residual grows when some features are left out, shape (q, m)."""
+        left_out = fit.coefficients[features]
+        # Products of single numbers in a batch are slow
+        return _summed(left_out * (spread @ left_out if features.shape[1] > 1 else spread * left_out))
 
     def _effects(self, fit: _Fit) -> np.ndarray:
         effects = np.zeros(self.shape)

@@ -145,6 +145,7 @@ class Limits:
     :param of_dynamics: Degeneracy among (s, a), the possible causes of s'
     :param of_reward: Degeneracy among (s', a), the possible causes of r
     :param action_vif: Variance inflation factors of the actions among (s, a), shape (d,)
+    :param state_vif: The same of the states, shape (n,)
     :param constant_variables: Names of the variables that never moved
     :param duplicated_variables: Groups of names that are linear functions of each other, among (s, a) or among (s', a)
     """
@@ -152,6 +153,7 @@ class Limits:
     of_dynamics: Degeneracy
     of_reward: Degeneracy
     action_vif: np.ndarray
+    state_vif: np.ndarray
     constant_variables: tuple[str, ...]
     duplicated_variables: tuple[tuple[str, ...], ...]
 
@@ -161,6 +163,7 @@ class Limits:
         """
         return {
             "action_vif": self.action_vif,
+            "state_vif": self.state_vif,
             "constant_variables": self.constant_variables,
             "duplicated_variables": self.duplicated_variables,
             "found_at": datetime.now(timezone.utc).isoformat(timespec="seconds"),
@@ -187,6 +190,7 @@ def find_limits(correlation: np.ndarray, variables: TransitionVariables) -> Limi
         of_dynamics,
         of_reward,
         action_vif=_inflation(factor, variables.n_actions),
+        state_vif=_inflation(factor, len(factor))[: variables.n_states],
         constant_variables=tuple(names[i] for i in constant),
         duplicated_variables=tuple(tuple(names[columns[i]] for i in sorted(group)) for columns, group in listed),
     )

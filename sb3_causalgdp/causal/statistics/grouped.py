@@ -170,6 +170,10 @@ class GroupedStatistics:
             standard_errors=None if graph.standard_errors is None else graph.standard_errors[at],
             r_squared=None if graph.r_squared is None else graph.r_squared[self._row_of],
             action_vif=None if graph.action_vif is None else graph.action_vif[actions],
+            evidence=None if graph.evidence is None else graph.evidence[at],
+            # A member can be lost in the mean of its group: that no effect is seen says nothing
+            detectable_r2=None if graph.detectable_r2 is None else np.ones(variables.n_states + 1),
+            state_vif=None if graph.state_vif is None else graph.state_vif[self._column_of[: variables.n_states]],
             constant_variables=tuple(variables.names[i] for i in np.flatnonzero(constant)),
             duplicated_variables=(),
             n_samples=self.n_samples,
