@@ -9,6 +9,7 @@ import yaml
 PEERS = ("sac", "td3", "tqc", "crossq")
 VARIANTS: dict[str, dict[str, Any]] = {
     "causalgdp": {},
+    "causalgdp_abstraction": {"causal_abstraction": True},
     "causalgdp_open": {"causal_discovery": "fully_connected"},
     "causalgdp_perturbed": {
         "causal_discovery": "perturbed",

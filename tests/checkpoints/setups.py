@@ -69,6 +69,9 @@ class Setup(NamedTuple):
         return [evaluation, TrainingCheckpointCallback(folder, every=every, keep=keep)]
 
 
+# So that it hides something within these few steps
+HIDES_EARLY = {"low": 0.5, "patience": 1, "detectable": 1.0, "known": 0.0, "min_reward_r2": 0.0}
+
 SETUPS = {
     "Pendulum": Setup(),
     "HalfCheetah": Setup("HalfCheetah-v5", arguments={"train_freq": 4}),
@@ -90,6 +93,7 @@ SETUPS = {
     "whole episodes, schedules": Setup(
         arguments={"train_freq": (1, "episode"), "gradient_steps": 5, "learning_rate": LinearSchedule(1e-3, 0.0, 1.0)}
     ),
+    "abstraction": Setup("sb3_causalgdp.stress:Distracted/Pendulum-v1", arguments={"causal_abstraction": HIDES_EARLY}),
     "SAC": Setup(arguments={"learning_starts": 50}, algorithm=SAC),
 }
 

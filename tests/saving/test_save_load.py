@@ -234,6 +234,7 @@ ARGUMENTS = {
     "causal_discovery_kwargs": {"threshold": 0.05},
     "causal_window": 5_000,
     "sample_masks": False,
+    "causal_abstraction": {"patience": 3},
     "offline_dataset": "D4RL/pointmaze/umaze-v2",
     "pretrain_steps": 9,
     "offline_fraction": 0.25,
