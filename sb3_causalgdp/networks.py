@@ -99,7 +99,7 @@ class Critic(PickledAlone, ContinuousCritic):
         gate = th.ones(get_action_dim(kwargs["action_space"])) if gates_actions else None
         self.register_buffer("action_gate", gate, persistent=False)
         n_inputs = kwargs["features_dim"] + get_action_dim(kwargs["action_space"])
-        norms: dict[str, list[Any]] = {}
+        norms: dict[str, Any] = {}
         if normalization == "layer":
             norms = {"post_linear_modules": [nn.LayerNorm]}
         elif normalization == "batch":

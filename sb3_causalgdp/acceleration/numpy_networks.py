@@ -132,6 +132,7 @@ class _BatchNorm:
     """``nn.BatchNorm1d`` of columns, by its running averages."""
 
     def __init__(self, module: nn.BatchNorm1d) -> None:
+        assert module.running_mean is not None and module.running_var is not None
         arrays = (module.weight, module.bias, module.running_mean, module.running_var)
         self.weight, self.bias, self.mean, self.variance = (view(array)[:, None] for array in arrays)
         self.epsilon = np.float32(module.eps)
