@@ -1,6 +1,6 @@
 """Inside networks, when an input or an output is hidden or shown again: nothing jumps, and nothing old comes back."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator
 
 import torch as th
 from torch import nn
@@ -9,7 +9,7 @@ SECOND_MOMENTS = ("sq", "sum")  # in the names that optimizers give to means of 
 
 
 def forget_inputs(
-    network: Sequence[nn.Module],
+    network: Iterable[nn.Module],
     columns: th.Tensor,
     known: th.Tensor,
     unit: tuple[th.Tensor, th.Tensor],
@@ -25,13 +25,14 @@ def forget_inputs(
     :param unit: Mean and variance that the inputs will have, each of shape ``(inputs,)``
     :param optimizer: Of its parameters, None if it has none
     """
-    layer = next(module for module in network if isinstance(module, nn.Linear))
-    if isinstance(network[0], nn.BatchNorm1d):
-        norm = network[0]
+    modules = list(network)
+    layer = next(module for module in modules if isinstance(module, nn.Linear))
+    norm = modules[0]
+    if isinstance(norm, nn.BatchNorm1d):
         assert norm.running_mean is not None and norm.running_var is not None
         scale = norm.weight / (norm.running_var + norm.eps).sqrt()
         of_zeros = norm.bias - norm.running_mean * scale
-        layer.bias += layer.weight @ th.where(columns, of_zeros, 0.0)
+        layer.bias.add_(layer.weight @ th.where(columns, of_zeros, 0.0))
         norm.weight[columns], norm.bias[columns] = 1.0, 0.0
         # Those of a constant would magnify what now comes by up to 1 / sqrt(eps)
         norm.running_mean[columns], norm.running_var[columns] = unit[0][columns], unit[1][columns]
@@ -57,7 +58,7 @@ def forget_outputs(layer: nn.Linear, rows: th.Tensor, optimizer: th.optim.Optimi
 
 def _forget_moments(optimizer: th.optim.Optimizer | None, parameter: th.Tensor, columns: th.Tensor, known: th.Tensor) -> None:
     for name, moment in _moments(optimizer, parameter):
-        others = 0.0
+        others: float | th.Tensor = 0.0
         if name.endswith(SECOND_MOMENTS) and bool(known.any()):
             # With 0, Adam's first steps would be up to 30 times as long as all others
             others = moment[..., known].mean(dim=-1, keepdim=True)

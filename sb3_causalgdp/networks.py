@@ -120,7 +120,7 @@ class Critic(PickledAlone, ContinuousCritic):
         modules = (module for network in self.q_networks for module in network.modules())
         self._batch_norms = tuple(module for module in modules if isinstance(module, nn.BatchNorm1d))
 
-    def forward(self, obs: PyTorchObs, actions: th.Tensor) -> tuple[th.Tensor, ...]:
+    def forward(self, obs: th.Tensor, actions: th.Tensor) -> tuple[th.Tensor, ...]:
         return super().forward(obs, modelled(self, actions))
 
     @property
@@ -262,7 +262,7 @@ class DiffusionActor(PickledAlone, BasePolicy):
         )
         self.one_pass = None
         if one_pass:
-            layers = create_mlp(features_dim, self.action_dim, net_arch, fast(activation_fn), squash_output=True)
+            layers = create_mlp(features_dim, self.action_dim, net_arch, fast(activation_fn), squash_output=True)  # type: ignore[arg-type]
             self.one_pass = nn.Sequential(*layers)
             make_layers_fast(self.one_pass)
 

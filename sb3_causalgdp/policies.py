@@ -33,7 +33,7 @@ from sb3_causalgdp.causal import (
 )
 from sb3_causalgdp.causal.guidance import OutcomeTarget
 from sb3_causalgdp.checks import is_finite
-from sb3_causalgdp.diffusion import GuidanceRule
+from sb3_causalgdp.diffusion import GuidanceRule, MLPDenoiser
 from sb3_causalgdp.divergence import TrainingDivergedError
 from sb3_causalgdp.export import export_policy
 from sb3_causalgdp.extractors import StandardizedExtractor
@@ -150,6 +150,10 @@ class CausalGDPPolicy(SavedPolicy):
         check_arguments(POLICY_ARGUMENTS, locals())
         check_keywords("features_extractor_kwargs", features_extractor_kwargs or {}, features_extractor_class)
         check_keywords("optimizer_kwargs", optimizer_kwargs or {}, optimizer_class)
+        if causal_abstraction and (denoiser != "mlp" or one_pass):
+            raise ValueError(
+                f"causal_abstraction must be False where the actor is no denoiser 'mlp', got True with {denoiser!r}"
+            )
         super().__init__(
             observation_space,
             action_space,
@@ -386,9 +390,9 @@ class CausalGDPPolicy(SavedPolicy):
         for network, optimizer in self._trained_networks():
             if isinstance(network, Critic):
                 for q_network in network.q_networks:
-                    forget_inputs(q_network, inputs, known_inputs, unit, optimizer)
+                    forget_inputs(q_network.children(), inputs, known_inputs, unit, optimizer)
             else:
-                layer = network.denoiser.input_layer
+                layer, _ = _layers_of(network.denoiser)
                 times = th.zeros(layer.in_features - len(inputs), dtype=th.bool, device=self.device)
                 # Of noisy actions the weights are 0 since they were hidden
                 columns = th.cat([th.zeros_like(actions), times, states])
@@ -398,9 +402,7 @@ class CausalGDPPolicy(SavedPolicy):
         """Let the denoisers neither see nor give components of actions."""
         for network, optimizer in self._trained_networks():
             if isinstance(network, DiffusionActor):
-                layer = network.denoiser.input_layer
-                last = [layer, *network.denoiser.network][-1]
-                assert isinstance(last, th.nn.Linear)
+                layer, last = _layers_of(network.denoiser)
                 others = th.zeros(layer.in_features - len(actions), dtype=th.bool, device=self.device)
                 columns = th.cat([actions, others])
                 forget_inputs([layer], columns, ~columns, (columns, columns), optimizer)
@@ -419,15 +421,15 @@ class CausalGDPPolicy(SavedPolicy):
         state_dict = dict(state_dict)
         if self.causal_abstraction:
             if strict:
-                gates = {"state_gate": self.state_gate, "action_gate": self.action_gate}
-                state_dict = {**{name: th.ones_like(gate) for name, gate in gates.items()}, **state_dict}
+                open_gates = {"state_gate": th.ones_like(self.state_gate), "action_gate": th.ones_like(self.action_gate)}
+                state_dict = {**open_gates, **state_dict}
             result = super().load_state_dict(state_dict, strict, assign)
             self._write_action_gates()
             return result
         gates = [state_dict.pop(name, None) for name in ("state_gate", "action_gate")]
         result = super().load_state_dict(state_dict, strict, assign)
-        if all(isinstance(gate, th.Tensor) for gate in gates):
-            shown, modelled = (gate.to(self.device) > 0.0 for gate in gates)
+        if gates[0] is not None and gates[1] is not None:
+            shown, modelled = (th.as_tensor(gate, device=self.device) > 0.0 for gate in gates)
             with th.no_grad():
                 self._begin_anew(~shown, ~modelled, shown, modelled)
                 self.update_observation_statistics()
@@ -662,6 +664,14 @@ class CausalGDPPolicy(SavedPolicy):
     @classmethod
     def known_classes(cls) -> Known:
         return KNOWN + Known([], [CausalGDPPolicy, CnnPolicy, MultiInputPolicy])
+
+
+def _layers_of(denoiser: nn.Module) -> tuple[nn.Linear, nn.Linear]:
+    """The first and the last layer of a perceptron."""
+    assert isinstance(denoiser, MLPDenoiser)
+    last = [denoiser.input_layer, *denoiser.network][-1]
+    assert isinstance(last, nn.Linear)
+    return denoiser.input_layer, last
 
 
 def _leaf_spaces(space: spaces.Space) -> list[spaces.Space]:
