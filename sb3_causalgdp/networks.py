@@ -268,10 +268,28 @@ class DiffusionActor(PickledAlone, BasePolicy):
         noise: th.Tensor | None = None,
         guidance: Guidance | None = None,
         rule: GuidanceRule | None = None,
+    ) -> th.Tensor:
+        """
+        Actions: those of :meth:`denoise`, or, with a one-pass network, what this says alone.
+
+        :param features: Shape ``(batch, features_dim)``
+        :param noise: As for :meth:`denoise`
+        :param guidance: As for :meth:`denoise`
+        :param rule: As for :meth:`denoise`
+        :return: Actions in [-1, 1], shape ``(batch, d)``
+        """
+        return self.denoise(features, noise, guidance, rule) if self.one_pass is None else self.one_pass(features)
+
+    def denoise(
+        self,
+        features: th.Tensor,
+        noise: th.Tensor | None = None,
+        guidance: Guidance | None = None,
+        rule: GuidanceRule | None = None,
         divergences: list[th.Tensor] | None = None,
     ) -> th.Tensor:
         """
-        Denoise actions, see :func:`sb3_causalgdp.diffusion.sample`; or, with a one-pass network, ask this alone.
+        Denoise actions, see :func:`sb3_causalgdp.diffusion.sample`.
 
         :param features: Shape ``(batch, features_dim)``
         :param noise: Shape ``(sampling_steps, batch, d)``, drawn if None
@@ -280,8 +298,6 @@ class DiffusionActor(PickledAlone, BasePolicy):
         :param divergences: If a list, each guided step appends its KL divergence
         :return: Actions in [-1, 1], shape ``(batch, d)``
         """
-        if self.one_pass is not None:
-            return self.one_pass(features)
         return sample(
             self.denoiser,
             self.schedule,
