@@ -542,9 +542,7 @@ class CausalGDP(AskedAlgorithm, SavedAlgorithm):
             raise ValueError("distil() needs a policy that denoises, got one that acts in one pass")
         buffers = [buffer for buffer in (self.replay_buffer, self.offline_buffer) if buffer is not None]
         if sum(buffer.size() for buffer in buffers) == 0:
-            raise ValueError(
-                "distil() needs transitions, got an empty replay buffer: learn(), preload() or load_replay_buffer()"
-            )
+            raise ValueError("distil() needs transitions, got none: call learn(), preload() or load_replay_buffer()")
         numpy_state, rows = np.random.get_state(), 500
         with th.random.fork_rng():
             counts = [min(rows, n_observations - first) for first in range(0, n_observations, rows)]

@@ -299,10 +299,30 @@ class DiffusionActor(PickledAlone, BasePolicy):
         noise: th.Tensor | None = None,
         guidance: Guidance | None = None,
         rule: GuidanceRule | None = None,
+    ) -> th.Tensor:
+        """
+        Actions: those of :meth:`denoise`, or, with a one-pass network, what this says alone.
+
+        :param features: Shape ``(batch, features_dim)``
+        :param noise: As for :meth:`denoise`
+        :param guidance: As for :meth:`denoise`
+        :param rule: As for :meth:`denoise`
+        :return: Actions in [-1, 1], shape ``(batch, d)``
+        """
+        if self.one_pass is not None:
+            return modelled(self, self.one_pass(features))
+        return self.denoise(features, noise, guidance, rule)
+
+    def denoise(
+        self,
+        features: th.Tensor,
+        noise: th.Tensor | None = None,
+        guidance: Guidance | None = None,
+        rule: GuidanceRule | None = None,
         divergences: list[th.Tensor] | None = None,
     ) -> th.Tensor:
         """
-        Denoise actions, see :func:`sb3_causalgdp.diffusion.sample`; or, with a one-pass network, ask this alone.
+        Denoise actions, see :func:`sb3_causalgdp.diffusion.sample`.
 
         :param features: Shape ``(batch, features_dim)``
         :param noise: Shape ``(sampling_steps, batch, d)``, drawn if None
@@ -311,8 +331,6 @@ class DiffusionActor(PickledAlone, BasePolicy):
         :param divergences: If a list, each guided step appends its KL divergence
         :return: Actions in [-1, 1], shape ``(batch, d)``
         """
-        if self.one_pass is not None:
-            return modelled(self, self.one_pass(features))
         if self.action_gate is not None:
             if noise is None:
                 shape = (self.n_noises, len(features), self.action_dim)

@@ -6,7 +6,19 @@ import torch as th
 from sb3_causalgdp.causal import MaskedWorldModel
 from sb3_causalgdp.diffusion import GuidanceRule, NoiseSchedule, sample
 from sb3_causalgdp.diffusion.bounds import bounded, outside
-from sb3_causalgdp.losses import critic_loss, denoising_loss, q_loss, quantile, td_target, world_model_loss
+from sb3_causalgdp.losses import (
+    advantage_weights,
+    critic_loss,
+    denoising_loss,
+    expectile_loss,
+    improved_actions,
+    improvement_weights,
+    q_loss,
+    quantile,
+    td_target,
+    trust_region_loss,
+    world_model_loss,
+)
 
 SCHEDULE = NoiseSchedule("vp", 5)
 
@@ -259,3 +271,84 @@ def test_weights_of_zero_alone_give_no_loss(transitions):
 def test_a_quantile_is_that_of_pytorch(n_values, share):
     values = th.randn(n_values, generator=th.Generator().manual_seed(n_values))
     th.testing.assert_close(quantile(values, share), th.quantile(values, share))
+
+
+# Those of other methods -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("expectile, value", [(0.5, 2.0), (0.9, 3.6), (0.1, 0.4)])
+def test_the_expectile_of_two_values_is_found(expectile, value):
+    # Of 0 and 4: the share of 4 is the expectile
+    targets = th.tensor([[0.0], [4.0]])
+    values = th.tensor([[1.0]], requires_grad=True)
+    optimizer = th.optim.SGD([values], lr=0.5)
+    for _ in range(200):
+        optimizer.zero_grad()
+        expectile_loss(values, targets, expectile).backward()
+        optimizer.step()
+    assert values.item() == pytest.approx(value, abs=1e-3)
+
+
+def test_advantages_weigh_in_units_of_their_own_size():
+    advantages = th.tensor([[-1.0], [0.0], [1.0]])
+    weights = advantage_weights(advantages, 2.0)
+    th.testing.assert_close(weights, advantage_weights(100.0 * advantages, 2.0))
+    assert weights.mean().item() == pytest.approx(1.0)
+    assert (weights[2] / weights[1]).item() == pytest.approx(math.exp(3.0))
+    assert (weights[1] / weights[0]).item() == pytest.approx(math.exp(3.0))
+    th.testing.assert_close(advantage_weights(advantages, 0.0), th.ones(3, 1))
+    assert (advantage_weights(advantages, 50.0)[2] / advantage_weights(advantages, 50.0)[1]).item() == pytest.approx(100.0)
+    th.testing.assert_close(advantage_weights(th.zeros(3, 1), 2.0), th.ones(3, 1))
+
+
+def test_improved_actions_are_a_step_up_and_within_bounds():
+    actions, gradient = th.tensor([[0.0, 0.0], [0.95, 0.0], [0.3, 0.3]]), th.tensor([[3.0, 4.0], [1.0, 0.0], [0.0, 0.0]])
+    improved = improved_actions(actions, gradient, 0.1)
+    step = 0.1 * math.sqrt(2.0)
+    th.testing.assert_close(improved, th.tensor([[0.6 * step, 0.8 * step], [1.0, 0.0], [0.3, 0.3]]))
+
+
+def test_what_did_not_become_better_is_not_imitated():
+    weights = improvement_weights(th.zeros(4, 1), th.tensor([[-1.0], [0.0], [1.0], [3.0]]))
+    th.testing.assert_close(weights, th.tensor([[0.0], [0.0], [1.0], [3.0]]))
+    assert bool((improvement_weights(th.ones(2, 1), th.zeros(2, 1)) == 0.0).all())
+
+
+def test_weights_of_a_denoising_loss_choose_what_is_learned():
+    schedule, actions = NoiseSchedule("vp", 3), th.tensor([[0.5], [-0.5]])
+    parameter = th.zeros(1, requires_grad=True)
+
+    def loss(weights):
+        th.manual_seed(0)
+        return denoising_loss(
+            lambda action, step, features: action * 0.0 + parameter, schedule, actions, actions, weights=weights
+        )
+
+    (of_first,) = th.autograd.grad(loss(th.tensor([[2.0], [0.0]])).loss, parameter)
+    (of_second,) = th.autograd.grad(loss(th.tensor([[0.0], [2.0]])).loss, parameter)
+    (of_both,) = th.autograd.grad(loss(None).loss, parameter)
+    assert not th.allclose(of_first, of_second)
+    th.testing.assert_close(0.5 * (of_first + of_second), of_both)
+
+
+def test_the_trust_region_pulls_actions_to_where_the_behaviour_is_and_leaves_its_model_alone():
+    # The behaviour is N(0.4, 0.1^2), whose noise is known
+    schedule = NoiseSchedule("vp", 5)
+
+    class Behaviour(th.nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.mean = th.nn.Parameter(th.tensor(0.4))
+
+        def forward(self, action, step, features):
+            signal, left = schedule.sqrt_alpha_bar[step].unsqueeze(1), schedule.alpha_bar[step].unsqueeze(1)
+            return (action - signal * self.mean) * (1.0 - left).sqrt() / (0.01 * left + 1.0 - left)
+
+    behaviour = Behaviour()
+    actions = th.tensor([-0.5, 0.4, 0.9]).repeat_interleave(20_000).unsqueeze(1).requires_grad_()
+    th.manual_seed(0)
+    loss = trust_region_loss(behaviour, schedule, th.zeros(len(actions), 1), actions)
+    (gradient,) = th.autograd.grad(loss, actions, retain_graph=True)
+    below, at, above = gradient.view(3, -1).mean(dim=1).tolist()
+    assert below < 0.0 < above and abs(at) < 0.05 * above
+    assert th.autograd.grad(loss, behaviour.mean, allow_unused=True) == (None,)

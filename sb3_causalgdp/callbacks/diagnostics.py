@@ -25,8 +25,8 @@ def step_divergences(policy: CausalGDPPolicy, observations: PyTorchObs) -> th.Te
     """
     divergences: list[th.Tensor] = []
     features = policy.actor.features(observations)
-    guidance = policy.acting_guidance(policy.causal_state(observations), policy.actor.sample(features))
-    policy.actor.sample(features, None, guidance, policy.guidance_rule, divergences)
+    guidance = policy.acting_guidance(policy.causal_state(observations), policy.actor.denoise(features))
+    policy.actor.denoise(features, None, guidance, policy.guidance_rule, divergences)
     return th.stack(divergences)
 
 

@@ -86,8 +86,8 @@ def read_entry(entry: Any) -> dict[str, Any]:
     """
     if not isinstance(entry, Mapping):
         raise ValueError(f"the entry must be a mapping of hyperparameters, got {entry!r}")
-    entry = _without_preset(entry)
     _check_keys(entry)
+    entry = _without_preset(entry)
     arguments = constructor_arguments()
     return {key: _as_declared(key, read_numbers(value), arguments) for key, value in entry.items()}
 

@@ -255,3 +255,17 @@ def test_what_is_wrong_with_ones_own_denoiser_is_said_before_training():
 
 def test_the_default_is_the_plain_network():
     assert type(make("mlp")) is MLPDenoiser
+
+
+@pytest.mark.parametrize("name", DENOISERS)
+@pytest.mark.parametrize("step", [0, 2, 4, 1.5, th.tensor([0, 3, 4]), th.tensor([0.0, 1.5, 3.25])])
+def test_the_noise_follows_from_the_velocity_at_every_time(name, step):
+    schedule = NoiseSchedule("cosine", 5)
+    arguments = (2, 3, 5, [8, 8])
+    plain, denoiser = make_denoiser(name, *arguments), make_denoiser(name, *arguments, alpha_bar=schedule.alpha_bar)
+    denoiser.load_state_dict(plain.state_dict())
+    action, condition = th.randn(3, 2), th.randn(3, 3)
+    left = schedule.signal_left(step)
+    # v = signal eps - noise a0, and a = signal a0 + noise eps
+    expected = left.sqrt() * plain(action, step, condition) + (1.0 - left).sqrt() * action
+    th.testing.assert_close(denoiser(action, step, condition), expected, rtol=1e-4, atol=1e-4)

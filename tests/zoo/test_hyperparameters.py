@@ -12,7 +12,7 @@ import yaml
 from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.utils import LinearSchedule
 
-from sb3_causalgdp import CausalGDP
+from sb3_causalgdp import CausalGDP, preset
 from sb3_causalgdp.causal.world_model import MaskedWorldModel
 from sb3_causalgdp.offline.make import TASKS
 from sb3_causalgdp.policies import CausalGDPPolicy
@@ -334,3 +334,29 @@ def test_sampled_keyword_arguments_stand_beside_those_of_the_entry():
         "replay_buffer_kwargs": {"n_sampled_goal": 2},
     }
     assert entry["policy_kwargs"]["net_arch"] == [8]
+
+
+# Presets ----------------------------------------------------------------------------------------------------------------
+
+
+def test_a_preset_in_an_entry_is_its_arguments_of_which_those_of_the_entry_win():
+    entry = {"n_timesteps": 1_000, "policy": "MlpPolicy", "eta": 3.0, "policy_kwargs": {"n_critics": 5}}
+    read = read_entry({**entry, "preset": "edp"})
+    assert read == {**entry, **preset("edp", eta=3.0, policy_kwargs={"n_critics": 5})}
+    assert read["policy_kwargs"] == {"n_critics": 5, "sampling_steps": 15} and read["guidance"] is None
+    offline = read_entry({**entry, "preset": {"name": "edp", "offline": True, "guided": True}})
+    assert offline["learning_rate"] == 3e-4 and "guidance" not in offline
+
+
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        ({"preset": "edb"}, "did you mean 'edp'"),
+        ({"preset": {"offline": True}}, "preset must be a name, or a mapping of name, offline and guided"),
+        ({"preset": {"name": "edp", "online": True}}, "preset must be a name, or a mapping of name, offline and guided"),
+        ({"preset": "edp", "policy_kwargs": "dict(n_critics=5)"}, "policy_kwargs must be a mapping beside a preset"),
+    ],
+)
+def test_a_preset_that_cannot_be_read_is_refused(change, message):
+    with pytest.raises(ValueError, match=message):
+        read_entry({"n_timesteps": 1_000, "policy": "MlpPolicy", **change})

@@ -1,0 +1,218 @@
+"""Methods of other papers: each is a set of arguments with which CausalGDP trains, online and offline, guided or not."""
+
+import inspect
+import time
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+
+from sb3_causalgdp import CausalGDP, MlpPolicy, preset
+from sb3_causalgdp.acceleration.acting import OnePassActing
+from sb3_causalgdp.presets import METHODS, OFFLINE, PRESETS
+
+SMALL = {
+    "learning_starts": 210,
+    "causal_refresh_freq": 205,
+    "batch_size": 32,
+    "n_action_candidates": 4,
+    "seed": 0,
+    "policy_kwargs": {"net_arch": [16, 16], "world_model_net_arch": [8, 8]},
+}
+
+
+def vector(module):
+    return th.nn.utils.parameters_to_vector(module.parameters()).detach().clone()
+
+
+@pytest.mark.parametrize("guided", [False, True])
+@pytest.mark.parametrize("name", PRESETS)
+def test_each_trains_from_an_environment(name, guided):
+    model = CausalGDP("MlpPolicy", "Pendulum-v1", **preset(name, guided=guided, **SMALL))
+    before = vector(model.actor), vector(model.critic)
+    model.learn(400)
+    assert model.policy.is_guided is guided
+    after = vector(model.actor), vector(model.critic)
+    assert all(bool(new.isfinite().all()) and not th.equal(new, old) for new, old in zip(after, before, strict=True))
+    assert all(np.isfinite(value) for key, value in model.logger.name_to_value.items() if key.startswith("train/"))
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory):
+    path = tmp_path_factory.mktemp("data") / "pendulum.npz"
+    model = CausalGDP("MlpPolicy", "Pendulum-v1", **{**SMALL, "learning_starts": 1_000})
+    model.learn(400)
+    model.save_replay_buffer(path)
+    return str(path)
+
+
+@pytest.mark.parametrize("guided", [False, True])
+@pytest.mark.parametrize("name", PRESETS)
+def test_each_trains_offline_with_its_papers_settings(name, guided, dataset):
+    model = CausalGDP(
+        "MlpPolicy", "Pendulum-v1", **preset(name, offline=True, guided=guided, **SMALL), offline_dataset=dataset
+    )
+    before = vector(model.actor)
+    model.pretrain(gradient_steps=30)
+    assert bool(vector(model.actor).isfinite().all()) and not th.equal(vector(model.actor), before)
+    action, _ = model.predict(np.zeros(3, np.float32), deterministic=True)
+    assert action.shape == (1,) and np.isfinite(action).all()
+
+
+def test_presets_are_arguments_of_the_constructor_and_of_the_policy():
+    arguments, of_policy = (inspect.signature(kind.__init__).parameters for kind in (CausalGDP, MlpPolicy))
+    for settings in (*METHODS.values(), *OFFLINE.values()):
+        assert set(settings) <= set(arguments) and set(settings.get("policy_kwargs", {})) <= set(of_policy)
+    assert set(OFFLINE) == set(METHODS)
+
+
+def test_what_makes_a_method_wins_over_its_papers_other_settings_and_the_users_own_over_both():
+    given = preset("edp_iql", offline=True, eta=3.0, policy_kwargs={"n_critics": 5})
+    assert given["actor_update"] == "weighted" and given["learning_rate"] == 3e-4 and given["eta"] == 3.0
+    assert given["policy_kwargs"]["critic_normalization"] == "layer"
+    assert given["policy_kwargs"]["activation_fn"] == "mish" and given["policy_kwargs"]["n_critics"] == 5
+    given["policy_kwargs"]["sampling_steps"] = 1
+    assert preset("edp_iql")["policy_kwargs"]["sampling_steps"] == 15
+
+
+def test_guidance_is_off_unless_it_is_plugged_in():
+    assert all(preset(name)["guidance"] is None and "guidance" not in preset(name, guided=True) for name in PRESETS)
+    assert preset("edp", guidance="score")["guidance"] == "score"
+
+
+def test_an_unknown_preset_is_refused_with_the_one_that_may_be_meant():
+    with pytest.raises(ValueError, match=r"preset must be one of .*, got 'dqtl', did you mean 'dtql'\?"):
+        preset("dqtl")
+
+
+@pytest.mark.parametrize(
+    "arguments, message",
+    [
+        ({"actor_update": "weighted"}, "expectile must be a number with actor_update='weighted', got None"),
+        ({"expectile": 0.7}, "expectile must be None without target critics, got 0.7"),
+    ],
+)
+def test_arguments_that_do_not_go_together_are_refused(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        CausalGDP("MlpPolicy", "Pendulum-v1", **arguments)
+
+
+# What makes the methods -------------------------------------------------------------------------------------------------
+
+
+def test_the_targets_of_implicit_q_learning_ask_no_policy():
+    model = CausalGDP("MlpPolicy", "Pendulum-v1", **preset("edp_iql", **SMALL))
+    model.learn(250)
+    data = model.replay_buffer.sample(32)
+    _, target = model._updates.td_target(data)
+    with th.no_grad():
+        for parameter in model.actor_target.parameters():
+            parameter.add_(1.0)
+    assert th.equal(model._updates.td_target(data)[1], target)
+    with th.no_grad():
+        value = model.critic.value(data.next_observations)
+    discounts = model.gamma if data.discounts is None else data.discounts
+    th.testing.assert_close(target, data.rewards + (1.0 - data.dones) * discounts * value)
+
+
+def test_the_attention_preset_looks_along_the_graph_that_was_found():
+    model = CausalGDP("MlpPolicy", "Pendulum-v1", **preset("attention", **SMALL))
+    assert bool((model.actor.denoiser.attention == 1.0).all())
+    model.learn(400)
+    assert not bool((model.actor.denoiser.attention == 1.0).all())
+    assert th.equal(model.actor.denoiser.attention, model.actor_target.denoiser.attention)
+
+
+def test_the_one_pass_policy_asks_the_denoiser_nothing_and_survives_saving(tmp_path):
+    model = CausalGDP("MlpPolicy", "Pendulum-v1", **preset("dtql", guided=True, **SMALL))
+    model.learn(400)
+    observations = np.random.default_rng(0).normal(size=(8, 3)).astype(np.float32)
+    actions, _ = model.predict(observations, deterministic=True)
+    assert isinstance(model.policy._acting, OnePassActing)
+    with th.no_grad():
+        features = model.actor.features(th.as_tensor(observations))
+        plain = 2.0 * model.actor.one_pass(features).numpy()  # Pendulum's torques reach to 2
+    np.testing.assert_allclose(actions, plain, rtol=1e-4, atol=1e-5)
+    model.save(tmp_path / "model")
+    loaded = CausalGDP.load(tmp_path / "model", env="Pendulum-v1")
+    np.testing.assert_array_equal(loaded.predict(observations, deterministic=True)[0], actions)
+    assert th.equal(vector(loaded.critic), vector(model.critic))
+    with th.no_grad():
+        for parameter in model.actor.denoiser.parameters():
+            parameter.fill_(th.nan)
+    np.testing.assert_array_equal(model.predict(observations, deterministic=True)[0], actions)
+
+
+# Distillation -----------------------------------------------------------------------------------------------------------
+
+
+class Aim(gym.Env):
+    """The reward is how near the action is to half of the observation."""
+
+    observation_space = gym.spaces.Box(-1.0, 1.0, (2,))
+    action_space = gym.spaces.Box(-1.0, 1.0, (1,))
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.state, self.n_steps = self.np_random.uniform(-1.0, 1.0, 2).astype(np.float32), 0
+        return self.state, {}
+
+    def step(self, action):
+        reward = -float(abs(action[0] - 0.5 * self.state[0]))
+        self.state, self.n_steps = self.np_random.uniform(-1.0, 1.0, 2).astype(np.float32), self.n_steps + 1
+        return self.state, reward, False, self.n_steps == 20, {}
+
+
+@pytest.fixture(scope="module")
+def teacher():
+    policy_kwargs = {"net_arch": [64, 64], "world_model_net_arch": [16, 16]}
+    arguments = {"learning_starts": 200, "causal_refresh_freq": 300, "batch_size": 64, "gamma": 0.5, "seed": 0}
+    return CausalGDP("MlpPolicy", Aim(), policy_kwargs=policy_kwargs, **arguments).learn(900)
+
+
+def test_a_distilled_policy_does_what_the_guided_one_does(teacher, tmp_path):
+    assert teacher.policy.is_guided
+    student = teacher.distil(n_observations=1_000, gradient_steps=1_500)
+    observations, drawn = np.random.default_rng(1).uniform(-1.0, 1.0, (2, 2_000, 2)).astype(np.float32)
+    actions, _ = teacher.predict(observations, deterministic=True)
+    imitated, _ = student.predict(observations, deterministic=True)
+    guided, distilled, random = (np.abs(one[:, 0] - 0.5 * observations[:, 0]).mean() for one in (actions, imitated, drawn))
+    assert guided < 0.5 * random
+    assert distilled < guided + 0.03 * (random - guided)
+    assert np.abs(imitated - actions).mean() < 0.05
+    student.save(tmp_path / "policy")
+    loaded = MlpPolicy.load(tmp_path / "policy")
+    np.testing.assert_array_equal(loaded.predict(observations, deterministic=True)[0], imitated)
+
+
+def test_distilling_leaves_the_model_as_it_was(teacher):
+    before, buffers = vector(teacher.policy), (np.random.get_state()[1].copy(), th.random.get_rng_state())
+    teacher.distil(n_observations=600, gradient_steps=5)
+    assert th.equal(vector(teacher.policy), before)
+    assert np.array_equal(np.random.get_state()[1], buffers[0]) and th.equal(th.random.get_rng_state(), buffers[1])
+
+
+def test_a_distilled_policy_is_quicker(teacher):
+    student = teacher.distil(n_observations=100, gradient_steps=2)
+
+    def seconds(policy):
+        observation = np.zeros(2, np.float32)
+        policy.predict(observation, deterministic=True)
+        times = []
+        for _ in range(200):
+            start = time.process_time()
+            policy.predict(observation, deterministic=True)
+            times.append(time.process_time() - start)
+        return np.median(times)
+
+    assert seconds(student) < 0.7 * seconds(teacher.policy)
+
+
+def test_distilling_needs_a_policy_that_denoises_and_transitions(teacher):
+    with pytest.raises(ValueError, match="needs transitions, got none"):
+        CausalGDP("MlpPolicy", Aim()).distil()
+    with pytest.raises(ValueError, match="needs a policy that denoises"):
+        CausalGDP("MlpPolicy", Aim(), **preset("dtql", **SMALL)).distil()
+    with pytest.raises(ValueError, match=r"gradient_steps must be an integer from 1 .*, got 0"):
+        teacher.distil(gradient_steps=0)
