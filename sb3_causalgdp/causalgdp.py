@@ -11,6 +11,7 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
+from stable_baselines3.common.logger import TensorBoardOutputFormat
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy, ContinuousCritic
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
@@ -180,6 +181,8 @@ class CausalGDP(AskedAlgorithm, SavedAlgorithm):
 
     # What a gradient step does: a subclass may have its own
     updates_class: ClassVar[type[Updates]] = Updates
+
+    PICTURE_BUDGET = 0.01
 
     def __init__(
         self,
@@ -440,11 +443,24 @@ class CausalGDP(AskedAlgorithm, SavedAlgorithm):
         if n_own == 0:
             # In front of the others, so that evaluations and checkpoints see the new masks
             callbacks = [CausalWorldModelCallback(), *callbacks]
+        callbacks += self._pictures_for_tensorboard(callbacks)
         # Behind the others, which have then counted the step that a checkpoint of pretrain() is about
         callbacks = sorted(callbacks, key=lambda one: isinstance(one, TrainingCheckpointCallback))
         all_of_them = super()._init_callback(CallbackList(callbacks), progress_bar)
         begin_training(self, all_of_them)
         return all_of_them
+
+    def _pictures_for_tensorboard(self, callbacks: list[BaseCallback]) -> list[BaseCallback]:
+        """Unless the user has own ones: at refreshes, in a hundredth of the training's time."""
+        if not any(isinstance(one, TensorBoardOutputFormat) for one in self.logger.output_formats):
+            return []
+        try:
+            from sb3_causalgdp.callbacks.pictures import CausalPicturesCallback
+        except ImportError:  # without matplotlib
+            return []
+        if any(isinstance(one, CausalPicturesCallback) for top in callbacks for one in all_callbacks(top)):
+            return []
+        return [CausalPicturesCallback(self.causal_refresh_freq, budget=self.PICTURE_BUDGET)]
 
     def train(self, gradient_steps: int, batch_size: int = 256) -> None:
         if self._waits_for_episode():

@@ -9,10 +9,9 @@ PACKAGE = Path(sb3_causalgdp.__file__).parent
 # From the roof to the ground: imports go down; the parts of one line do not import each other. A part is a folder, or a file
 LAYERS = [
     {"zoo", "datasets"},
-    {"callbacks.pictures"},
     {"__init__"},
     {"causalgdp"},
-    {"saving.algorithm"},
+    {"saving.algorithm", "callbacks.pictures"},
     {"callbacks", "checkpoints", "knowledge"},
     {"callbacks.world_model", "updates"},
     {"losses", "batches", "distillation", "callbacks.diagnostics", "questions", "acceleration.fast_steps"},

@@ -1,6 +1,7 @@
 """Pictures of a training as it goes: the causal graph, the effects of the actions, the guidance along the denoising chain."""
 
 import os
+import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -20,10 +21,11 @@ from sb3_causalgdp.causal.plots import View, plot_action_effects, plot_causal_gr
 from sb3_causalgdp.causal.plots.figures import FONT_SIZE, check_choice, save_figure
 from sb3_causalgdp.causal.plots.graphs import KINDS
 from sb3_causalgdp.causal.plots.view import view_of
-from sb3_causalgdp.causalgdp import CausalGDP
+from sb3_causalgdp.knowledge import DiscoveringAlgorithm
 from sb3_causalgdp.policies import CausalGDPPolicy
 
 try:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
     from matplotlib.ticker import MaxNLocator
 except ImportError as error:
@@ -52,10 +54,14 @@ class CausalPicturesCallback(BaseCallback):
     :param verbose: Verbosity level: 1 says when pictures were drawn
     :param kind: Kind of the graph's picture: ``"heat_map"``, ``"graph"`` or ``"both"``
     :param view: What the graph's picture shows: a :class:`~sb3_causalgdp.causal.plots.View`, or its fields by name
+    :param budget: Largest share of the training's time that drawing may take, such as 0.01: a picture that is due waits until
+        there has been time for it; None sets no limit
     :raises ValueError: If a number is below 1, or a field of the view is not known or out of range
     """
 
-    model: CausalGDP
+    model: DiscoveringAlgorithm
+    # Before the first time is known
+    EXPECTED_SECONDS = 1.0
 
     def __init__(
         self,
@@ -65,6 +71,7 @@ class CausalPicturesCallback(BaseCallback):
         verbose: int = 0,
         kind: str = "heat_map",
         view: View | Mapping[str, Any] | None = None,
+        budget: float | None = None,
     ) -> None:
         super().__init__(verbose)
         for name, value in (("save_freq", save_freq), ("batch_size", batch_size)):
@@ -76,24 +83,35 @@ class CausalPicturesCallback(BaseCallback):
         check_choice("kind", kind, KINDS)
         self.kind = kind
         self.view = view if isinstance(view, View) else view_of(None, view or {})
+        if budget is not None and not 0.0 < budget <= 1.0:
+            raise ValueError(f"budget must be a share above 0 and up to 1, or None, got {budget!r}")
+        self.budget = budget
         self._last_steps = 0
+        self._started = self._seconds = 0.0
+        self._expected = self.EXPECTED_SECONDS
 
     def _init_callback(self) -> None:
-        if not isinstance(self.model, CausalGDP):
+        if not isinstance(self.model, DiscoveringAlgorithm):
             raise TypeError(f"CausalPicturesCallback draws a CausalGDP, got {type(self.model).__name__}")
         self._last_steps = self.model.num_timesteps
 
     def _on_training_start(self) -> None:
+        self._started, self._seconds = time.perf_counter(), 0.0
         if not self._has_viewers():
             warnings.warn("CausalPicturesCallback draws nothing: give it a folder, or the model a tensorboard_log")
 
     def _on_step(self) -> bool:
         # A picture that is due waits for the first graph
         is_due = self.num_timesteps - self._last_steps >= self.save_freq
-        if is_due and self.model._causal_graph is not None and self._has_viewers():
+        if is_due and self.model._causal_graph is not None and self._has_time() and self._has_viewers():
             self._last_steps = self.num_timesteps
             self.draw()
         return True
+
+    def _has_time(self) -> bool:
+        if self.budget is None:
+            return True
+        return self._seconds + self._expected <= self.budget * (time.perf_counter() - self._started)
 
     def _has_viewers(self) -> bool:
         return self.folder is not None or any(not isinstance(one, TEXT_FORMATS) for one in self.logger.output_formats)
@@ -102,12 +120,15 @@ class CausalPicturesCallback(BaseCallback):
         """
         Draw now.
         """
+        start = time.perf_counter()
         with _undisturbed(self.model):
             for name, plot in self._plots():
                 figure = plot(self._path(name))
-                self.logger.record(
-                    f"pictures/{name}", sb3_logger.Figure(figure, close=False), exclude=("stdout", "log", "json", "csv")
-                )
+                # With a budget, what TensorBoard would do later is done and counted now
+                shown = sb3_logger.Figure(figure, close=False) if self.budget is None else _drawn(figure)
+                self.logger.record(f"pictures/{name}", shown, exclude=("stdout", "log", "json", "csv"))
+        self._expected = time.perf_counter() - start
+        self._seconds += self._expected
         if self.verbose >= 1:
             print(f"Pictures at {self.num_timesteps} steps")
 
@@ -130,6 +151,12 @@ class CausalPicturesCallback(BaseCallback):
         if model.policy.is_guided:
             divergences = step_divergences(model.policy, policy_input(model, observations)).cpu()
             yield "guidance", lambda path: plot_guidance_strength(divergences, path)
+
+
+def _drawn(figure: Figure) -> sb3_logger.Image:
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    return sb3_logger.Image(np.asarray(canvas.buffer_rgba())[..., :3].copy(), "HWC")
 
 
 def plot_guidance_strength(divergences: th.Tensor | np.ndarray, path: str | os.PathLike[str] | None = None) -> Figure:
@@ -194,7 +221,7 @@ def draw_transitions(
     return observations, policy.unscale_action(actions)
 
 
-def policy_input(model: CausalGDP, observations: np.ndarray | dict[str, np.ndarray]) -> PyTorchObs:
+def policy_input(model: DiscoveringAlgorithm, observations: np.ndarray | dict[str, np.ndarray]) -> PyTorchObs:
     """
     :param model: The model
     :param observations: A batch of observations, as the environment gives them
@@ -206,7 +233,7 @@ def policy_input(model: CausalGDP, observations: np.ndarray | dict[str, np.ndarr
 
 
 @contextmanager
-def _undisturbed(model: CausalGDP) -> Iterator[None]:
+def _undisturbed(model: DiscoveringAlgorithm) -> Iterator[None]:
     """What is drawn from torch's generators inside was not drawn, and the policy is in evaluation mode for a while."""
     was_training = model.policy.training
     devices = [model.device] if model.device.type == "cuda" else []

@@ -58,7 +58,6 @@ def test_divergence_leaves_no_gradient(observations):
     assert all(parameter.grad is None for parameter in policy.parameters())
 
 
-@pytest.mark.parametrize("guidance", ["posterior", "score"])
 def test_the_value_of_a_choice_is_that_of_the_actions_that_are_taken(observations):
     policy = make_policy(n_action_candidates=4)
     policy.guidance_ready.fill_(1.0)
@@ -83,6 +82,7 @@ def test_the_value_of_a_choice_is_that_of_the_actions_that_are_taken(observation
     assert choice(alone, observations[:1]).candidate_spread == 0.0
 
 
+@pytest.mark.parametrize("guidance", ["posterior", "score"])
 def test_step_size_bound_shrinks_with_the_scale(guidance, observations):
     bounds = [bound(observations, guidance=guidance, guidance_scale=scale) for scale in (0.01, 1.0, 100.0)]
     assert bounds[0].bound > bounds[1].bound > bounds[2].bound > 0.0

@@ -66,6 +66,56 @@ def test_files_and_tensorboard_hold_every_picture(tmp_path):
     assert [event.step for event in events.Images("pictures/guidance")] == [64]
 
 
+def test_tensorboard_has_pictures_without_asking_for_them(tmp_path, monkeypatch):
+    accumulator = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
+    monkeypatch.setattr(CausalPicturesCallback, "EXPECTED_SECONDS", 0.0)
+    env = gym.wrappers.TimeLimit(gym.make("Pendulum-v1"), 32)
+    model = make(env, tensorboard_log=str(tmp_path))
+    model.learn(64, callback=early(), log_interval=1)
+    events = accumulator.EventAccumulator(str(tmp_path / "CausalGDP_1"))
+    events.Reload()
+    assert sorted(events.Tags()["images"]) == [f"pictures/{name}" for name in NAMES]
+    plain = make(env)
+    plain.learn(64, callback=early(), log_interval=1)
+    states = [one.policy.state_dict() for one in (model, plain)]
+    assert all(th.equal(value, states[1][name]) for name, value in states[0].items())
+
+
+def test_nothing_is_drawn_where_there_is_no_tensorboard_and_beside_own_pictures(drawn, tmp_path):
+    pytest.importorskip("tensorboard")
+    make(learning_starts=1000).learn(64, callback=early())
+    make(learning_starts=1000, tensorboard_log=str(tmp_path)).learn(64, callback=[early(), CausalPicturesCallback(10_000)])
+    assert drawn == []
+
+
+def test_a_budget_is_kept(monkeypatch, tmp_path):
+    now, times = [0.0], []
+
+    def draw(self):
+        times.append(now[0])
+        self._expected = 0.5
+        self._seconds += 0.5
+
+    monkeypatch.setattr("sb3_causalgdp.callbacks.pictures.time.perf_counter", lambda: now[0])
+    monkeypatch.setattr(CausalPicturesCallback, "draw", draw)
+    callback = CausalPicturesCallback(1, tmp_path, budget=0.01)
+    callback.model = make()
+    callback.model._causal_graph = callback.model.causal_graph()
+    callback._on_training_start()
+    for second in range(400):
+        now[0], callback.num_timesteps = float(second), second
+        callback._on_step()
+    # A second is expected of the first, half a second of the others
+    assert times == [100.0, 101.0, 150.0, 200.0, 250.0, 300.0, 350.0]
+    assert 0.5 * len(times) <= 0.01 * 400
+
+
+@pytest.mark.parametrize("budget", [0.0, -0.1, 1.5])
+def test_a_budget_is_a_share(budget):
+    with pytest.raises(ValueError, match="budget must be a share above 0 and up to 1"):
+        CausalPicturesCallback(budget=budget)
+
+
 def test_text_logs_work_beside_the_pictures(tmp_path):
     model = make(gym.wrappers.TimeLimit(gym.make("Pendulum-v1"), 32))
     model.set_logger(configure(str(tmp_path / "logs"), ["stdout", "log", "json", "csv"]))

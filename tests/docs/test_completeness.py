@@ -239,7 +239,7 @@ ERRORS = {
     ),
     "The training diverged: critic_loss is inf at update 1.": diverge,
     "Nothing was loaded: policy.return_std holds nan": load_nan,
-    "critic.optimizer.state.0.exp_avg has the shape": load_a_state_of_another_size,
+    "critic.optimizer.state.2.exp_avg has the shape": load_a_state_of_another_size,
     "action_space: component 0 from 1 to 1 is fixed: leave it out, or": lambda: make(FixedEnv()),
     "gamma must be a number from 0 to 1, got 1.5": lambda: make(gamma=1.5),
     "guidance must be one of ['normalized', 'posterior', 'score'] or None, got 'plain'": lambda: make(guidance="plain"),
