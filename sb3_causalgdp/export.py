@@ -114,11 +114,10 @@ class ExportedPolicy(nn.Module):
 
     def _statistics(self, key: str) -> tuple[th.Tensor | None, th.Tensor | None]:
         """Mean and standard deviation of a part of the observation in double precision, as ``VecNormalize`` computes."""
-        if self.normalizer is None or (self.is_dict and key not in self.normalizer.norm_obs_keys):
+        if self.normalizer is None or (self.is_dict and key not in (self.normalizer.norm_obs_keys or ())):
             return None, None
-        statistics = self.normalizer.obs_rms
-        if isinstance(statistics, dict):
-            statistics = statistics[key]
+        of_all: Any = self.normalizer.obs_rms
+        statistics = of_all[key] if self.is_dict else of_all
         std = np.sqrt(statistics.var + self.normalizer.epsilon)
         return th.as_tensor(np.array(statistics.mean, np.float64)), th.as_tensor(np.array(std, np.float64))
 
@@ -126,7 +125,9 @@ class ExportedPolicy(nn.Module):
     def noise_shapes(self) -> dict[str, tuple[int, ...]]:
         """Of the noise of one observation, by the names of the inputs."""
         n_steps, n_candidates, action_dim = self.policy.candidate_noise.shape
-        shapes = {} if self.deterministic else {"noise": (n_steps, n_candidates, action_dim)}
+        shapes: dict[str, tuple[int, ...]] = {}
+        if not self.deterministic:
+            shapes["noise"] = (n_steps, n_candidates, action_dim)
         return {**shapes, "exploration_noise": (action_dim,)} if self.explores else shapes
 
     @property
