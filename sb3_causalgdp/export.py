@@ -99,6 +99,8 @@ class ExportedPolicy(nn.Module):
         self.policy = copy.deepcopy(policy, {id(optimizer): None for optimizer in optimizers}).to("cpu").requires_grad_(False)
         self.policy.set_training_mode(False)
         self.policy.guidance_ready.fill_(float(guided))
+        if self.policy.guidance_rule is not None:
+            self.policy.guidance_rule.differentiates_forwards = False
         self.guided = guided
         self.deterministic = deterministic
         self.explores = not deterministic and policy.exploration_noise > 0.0
