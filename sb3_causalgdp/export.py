@@ -99,6 +99,8 @@ class ExportedPolicy(nn.Module):
         self.policy = copy.deepcopy(policy, {id(optimizer): None for optimizer in optimizers}).to("cpu").requires_grad_(False)
         self.policy.set_training_mode(False)
         self.policy.guidance_ready.fill_(float(guided))
+        if self.policy.guidance_rule is not None:
+            self.policy.guidance_rule.differentiates_forwards = False
         self.guided = guided
         self.deterministic = deterministic
         self.explores = not deterministic and policy.exploration_noise > 0.0
@@ -114,11 +116,10 @@ class ExportedPolicy(nn.Module):
 
     def _statistics(self, key: str) -> tuple[th.Tensor | None, th.Tensor | None]:
         """Mean and standard deviation of a part of the observation in double precision, as ``VecNormalize`` computes."""
-        if self.normalizer is None or (self.is_dict and key not in self.normalizer.norm_obs_keys):
+        if self.normalizer is None or (self.is_dict and key not in (self.normalizer.norm_obs_keys or ())):
             return None, None
-        statistics = self.normalizer.obs_rms
-        if isinstance(statistics, dict):
-            statistics = statistics[key]
+        of_all: Any = self.normalizer.obs_rms
+        statistics = of_all[key] if self.is_dict else of_all
         std = np.sqrt(statistics.var + self.normalizer.epsilon)
         return th.as_tensor(np.array(statistics.mean, np.float64)), th.as_tensor(np.array(std, np.float64))
 
@@ -126,7 +127,9 @@ class ExportedPolicy(nn.Module):
     def noise_shapes(self) -> dict[str, tuple[int, ...]]:
         """Of the noise of one observation, by the names of the inputs."""
         n_steps, n_candidates, action_dim = self.policy.candidate_noise.shape
-        shapes = {} if self.deterministic else {"noise": (n_steps, n_candidates, action_dim)}
+        shapes: dict[str, tuple[int, ...]] = {}
+        if not self.deterministic:
+            shapes["noise"] = (n_steps, n_candidates, action_dim)
         return {**shapes, "exploration_noise": (action_dim,)} if self.explores else shapes
 
     @property

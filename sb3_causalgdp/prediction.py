@@ -51,7 +51,7 @@ def is_traced() -> bool:
     """
     :return: Whether PyTorch is recording what is computed for another program: numpy and gradients would leave no trace
     """
-    return th.jit.is_tracing() or _is_exporting() or th.onnx.is_in_onnx_export()
+    return th.jit.is_tracing() or _is_exporting()
 
 
 def _numpy_acting(policy: Policy, observation: PyTorchObs) -> NumpyActing | OnePassActing | None:

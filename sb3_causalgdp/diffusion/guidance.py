@@ -53,6 +53,9 @@ class GuidanceRule:
     :raises ValueError: If a name is unknown, or the scale is negative or not finite
     """
 
+    # Forward, the Jacobian of the denoiser is fastest; backward, PyTorch can trace it for every batch size
+    differentiates_forwards = True
+
     def __init__(
         self, mode: str = "posterior", covariance: str = "unit_gaussian", scale: float | Sequence[float] = 1.0
     ) -> None:
@@ -159,7 +162,9 @@ def guidance_shift(
     alpha_bar = schedule.signal_left(step).to(noisy_action.dtype)
     clean = (noisy_action - (1.0 - alpha_bar).sqrt() * noise) / alpha_bar.sqrt()
     gradient, curvature = guidance(clean if clip is None else clean.clamp(-clip, clip))
-    jacobian = clean_estimate_jacobian(predict_noise, noisy_action, step, alpha_bar) if rule.needs_jacobian else None
+    jacobian = None
+    if rule.needs_jacobian:
+        jacobian = clean_estimate_jacobian(predict_noise, noisy_action, step, alpha_bar, rule.differentiates_forwards)
     direction = rule(gradient, curvature, alpha_bar, jacobian)
     return rule.scale_at(step, alpha_bar) * (1.0 - alpha_bar).sqrt() * direction
 
@@ -169,6 +174,7 @@ def clean_estimate_jacobian(
     noisy_action: th.Tensor,
     step: int | float | th.Tensor,
     alpha_bar: th.Tensor,
+    forwards: bool = True,
 ) -> th.Tensor:
     """
     J_k = d a0_hat / d a^k of the denoiser, by d forward-mode products in one batch.
@@ -177,6 +183,7 @@ def clean_estimate_jacobian(
     :param noisy_action: a^k, shape ``(batch, d)``
     :param step: Diffusion step in [0, K-1], an index or a number between two: one for all, or shape ``(batch,)``
     :param alpha_bar: Share of signal left, shape ``(batch, 1)`` or ``(1, 1)``
+    :param forwards: Whether by forward-mode products; if not, by d backward passes
     :return: Shape ``(batch, d, d)``; entry ``[b, i, j]`` is the derivative of a0_hat_i by a^k_j
     """
 
@@ -185,5 +192,16 @@ def clean_estimate_jacobian(
         return th.func.jvp(lambda action: predict_noise(action, step), (noisy_action,), (tangents,))[1]
 
     identity = th.eye(noisy_action.shape[1], dtype=noisy_action.dtype, device=noisy_action.device)
-    noise_jacobian = th.func.vmap(column)(identity).permute(1, 2, 0)
+    if forwards:
+        noise_jacobian = th.func.vmap(column)(identity).permute(1, 2, 0)
+    else:
+        noise_jacobian = _jacobian_backwards(lambda action: predict_noise(action, step), noisy_action)
     return (identity - (1.0 - alpha_bar).sqrt().unsqueeze(2) * noise_jacobian) / alpha_bar.sqrt().unsqueeze(2)
+
+
+def _jacobian_backwards(function: Callable[[th.Tensor], th.Tensor], action: th.Tensor) -> th.Tensor:
+    with th.enable_grad():
+        action = action.detach().requires_grad_()
+        outputs = function(action).unbind(dim=1)
+        rows = [th.autograd.grad(output.sum(), action, retain_graph=True)[0] for output in outputs]
+    return th.stack(rows, dim=1)
