@@ -17,6 +17,7 @@ from sb3_causalgdp.causal import (
     TransitionVariables,
 )
 from sb3_causalgdp.causal.interventions import ActionRule
+from sb3_causalgdp.causal.world_model import MaskedWorldModel
 from sb3_causalgdp.offline.algorithm import OfflineToOnlineAlgorithm
 from sb3_causalgdp.policies import CausalGDPPolicy
 
@@ -27,6 +28,7 @@ class AskedAlgorithm(OfflineToOnlineAlgorithm):
     """An algorithm whose policy has a world model and a causal graph that can be asked."""
 
     policy: CausalGDPPolicy
+    world_model: MaskedWorldModel
     transition_variables: TransitionVariables
     _indices: TransitionVariables
     _causal_graph: CausalGraph | None

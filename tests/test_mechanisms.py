@@ -1,5 +1,7 @@
 """What fails when a mechanism is taken out."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 import torch as th
@@ -9,7 +11,7 @@ from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from sb3_causalgdp import CausalGDP, CausalWorldModelCallback
 from sb3_causalgdp.updates import StepPlan
 
-KWARGS = {
+KWARGS: dict[str, Any] = {
     "learning_starts": 50,
     "batch_size": 16,
     "train_freq": 4,

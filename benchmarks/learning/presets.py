@@ -5,6 +5,7 @@ import json
 import time
 
 import torch as th
+from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 
 from sb3_causalgdp import CausalGDP
@@ -21,7 +22,7 @@ def main() -> None:
     given = parser.parse_args()
     th.set_num_threads(1)
     model = CausalGDP("MlpPolicy", "Pendulum-v1", seed=given.seed, **preset(given.name, guided=given.guided))
-    environment = CausalGDP("MlpPolicy", "Pendulum-v1").get_env()
+    environment = make_vec_env("Pendulum-v1")
     seconds = 0.0
     for _ in range(0, given.steps, given.every):
         start = time.process_time()
@@ -29,6 +30,7 @@ def main() -> None:
         seconds += time.process_time() - start
         environment.seed(1_000)
         mean, std = evaluate_policy(model, environment, n_eval_episodes=20)
+        assert isinstance(mean, float) and isinstance(std, float)
         result = {"preset": given.name, "guided": given.guided, "seed": given.seed, "steps": model.num_timesteps}
         print(json.dumps({**result, "return": round(mean, 1), "std": round(std, 1), "seconds": round(seconds)}), flush=True)
 

@@ -230,6 +230,7 @@ def read(path: Path, kind: str) -> Any:
     if kind == "checkpoint.zip":
         model = CausalGDP.resume(path, "Pendulum-v1", device="cpu")
         model.learn(2, reset_num_timesteps=False)
+        assert model.replay_buffer is not None
         return [model.predict(observations, deterministic=True)[0], model.replay_buffer.rewards]
     if kind == "policy.pt":
         return [MlpPolicy.load(path, device="cpu").predict(observations, deterministic=True)[0]]

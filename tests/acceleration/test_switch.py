@@ -10,8 +10,8 @@ import torch as th
 
 from sb3_causalgdp import CausalGDP
 from sb3_causalgdp.acceleration import switch
-from sb3_causalgdp.acceleration.activations import FastMish
 from sb3_causalgdp.acceleration.acting import NumpyActing
+from sb3_causalgdp.acceleration.activations import FastMish
 from sb3_causalgdp.acceleration.device_replay import DeviceReplay
 from sb3_causalgdp.acceleration.products import LIBRARIES, use_library, uses_onednn
 

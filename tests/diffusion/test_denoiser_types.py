@@ -2,6 +2,7 @@
 
 import pytest
 import torch as th
+from small_models import SMALL
 from torch import nn
 
 from sb3_causalgdp import CausalGDP, CausalWorldModelCallback
@@ -17,7 +18,6 @@ from sb3_causalgdp.diffusion import (
     sample,
 )
 from sb3_causalgdp.losses import denoising_loss
-from small_models import SMALL
 
 ACTIONS, FEATURES, STEPS = 2, 3, 5
 
