@@ -26,12 +26,12 @@ def forget_inputs(
     :param optimizer: Of its parameters, None if it has none
     """
     layer = next(module for module in network if isinstance(module, nn.Linear))
-    if isinstance(network[0], nn.BatchNorm1d):
-        norm = network[0]
+    norm = network[0]
+    if isinstance(norm, nn.BatchNorm1d):
         assert norm.running_mean is not None and norm.running_var is not None
         scale = norm.weight / (norm.running_var + norm.eps).sqrt()
         of_zeros = norm.bias - norm.running_mean * scale
-        layer.bias += layer.weight @ th.where(columns, of_zeros, 0.0)
+        layer.bias.add_(layer.weight @ th.where(columns, of_zeros, 0.0))
         norm.weight[columns], norm.bias[columns] = 1.0, 0.0
         # Those of a constant would magnify what now comes by up to 1 / sqrt(eps)
         norm.running_mean[columns], norm.running_var[columns] = unit[0][columns], unit[1][columns]
@@ -57,7 +57,7 @@ def forget_outputs(layer: nn.Linear, rows: th.Tensor, optimizer: th.optim.Optimi
 
 def _forget_moments(optimizer: th.optim.Optimizer | None, parameter: th.Tensor, columns: th.Tensor, known: th.Tensor) -> None:
     for name, moment in _moments(optimizer, parameter):
-        others = 0.0
+        others: th.Tensor | float = 0.0
         if name.endswith(SECOND_MOMENTS) and bool(known.any()):
             # With 0, Adam's first steps would be up to 30 times as long as all others
             others = moment[..., known].mean(dim=-1, keepdim=True)

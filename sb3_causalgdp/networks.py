@@ -108,7 +108,7 @@ class Critic(PickledAlone, ContinuousCritic):
         self._batch_norms = tuple(module for module in modules if isinstance(module, nn.BatchNorm1d))
 
     def forward(self, obs: PyTorchObs, actions: th.Tensor) -> tuple[th.Tensor, ...]:
-        return super().forward(obs, modelled(self, actions))
+        return super().forward(obs, modelled(self, actions))  # type: ignore[arg-type]  # SB3 gives dictionaries, too
 
     @property
     def normalizes_batches(self) -> bool:

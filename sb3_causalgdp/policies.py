@@ -335,7 +335,7 @@ class CausalGDPPolicy(SavedPolicy):
         for network, optimizer in self._trained_networks():
             if isinstance(network, Critic):
                 for q_network in network.q_networks:
-                    forget_inputs(q_network, inputs, known_inputs, unit, optimizer)
+                    forget_inputs([*q_network.children()], inputs, known_inputs, unit, optimizer)
             else:
                 layer = network.denoiser.input_layer
                 times = th.zeros(layer.in_features - len(inputs), dtype=th.bool, device=self.device)
@@ -373,10 +373,10 @@ class CausalGDPPolicy(SavedPolicy):
             result = super().load_state_dict(state_dict, strict, assign)
             self._write_action_gates()
             return result
-        gates = [state_dict.pop(name, None) for name in ("state_gate", "action_gate")]
+        of_states, of_actions = state_dict.pop("state_gate", None), state_dict.pop("action_gate", None)
         result = super().load_state_dict(state_dict, strict, assign)
-        if all(isinstance(gate, th.Tensor) for gate in gates):
-            shown, modelled = (gate.to(self.device) > 0.0 for gate in gates)
+        if of_states is not None and of_actions is not None:
+            shown, modelled = of_states.to(self.device) > 0.0, of_actions.to(self.device) > 0.0
             with th.no_grad():
                 self._begin_anew(~shown, ~modelled, shown, modelled)
                 self.update_observation_statistics()
