@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any, TypeVar
 
+import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
@@ -20,6 +21,7 @@ from sb3_causalgdp.causal import (
     make_discovery,
     make_statistics,
 )
+from sb3_causalgdp.causal.endings import with_endings
 from sb3_causalgdp.causal.world_model import MaskedWorldModel
 from sb3_causalgdp.names import found_names
 from sb3_causalgdp.offline.algorithm import OfflineToOnlineAlgorithm
@@ -106,16 +108,19 @@ class DiscoveringAlgorithm(OfflineToOnlineAlgorithm):
         age = self.n_environment_steps - graph.num_timesteps
         return [*super().progress_parts(), edges, f"graph {age:,} steps old"]
 
-    def judge_relevance(self, graph: CausalGraph) -> Verdict | None:
+    def judge_relevance(self, graph: CausalGraph, ends: np.ndarray | None = None) -> Verdict | None:
         """
         Let the gate judge by a new graph, and hide what it has closed from actor and critics.
 
         :param graph: On this model's variables
+        :param ends: Which states are known to end episodes, boolean, shape ``(n,)``; these matter, too
         :return: The verdict, None without ``causal_abstraction``
         """
         gate = self.relevance_gate
         if gate is None:
             return None
+        if ends is not None:
+            graph = with_endings(graph, ends)
         # Where no state is known to matter, as before a sparse reward was seen, all that was found may be a cost of actions
         is_known = bool((graph.relevance().states > gate.high).any())
         verdict = gate.update(graph, reward_varied=is_known, keep_open=self._never_hidden())

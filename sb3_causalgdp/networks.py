@@ -120,8 +120,8 @@ class Critic(PickledAlone, ContinuousCritic):
         modules = (module for network in self.q_networks for module in network.modules())
         self._batch_norms = tuple(module for module in modules if isinstance(module, nn.BatchNorm1d))
 
-    def forward(self, obs: th.Tensor, actions: th.Tensor) -> tuple[th.Tensor, ...]:
-        return super().forward(obs, modelled(self, actions))
+    def forward(self, obs: PyTorchObs, actions: th.Tensor) -> tuple[th.Tensor, ...]:
+        return super().forward(obs, modelled(self, actions))  # type: ignore[arg-type]  # SB3 gives dictionaries, too
 
     @property
     def normalizes_batches(self) -> bool:

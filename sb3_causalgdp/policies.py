@@ -426,10 +426,10 @@ class CausalGDPPolicy(SavedPolicy):
             result = super().load_state_dict(state_dict, strict, assign)
             self._write_action_gates()
             return result
-        gates = [state_dict.pop(name, None) for name in ("state_gate", "action_gate")]
+        of_states, of_actions = state_dict.pop("state_gate", None), state_dict.pop("action_gate", None)
         result = super().load_state_dict(state_dict, strict, assign)
-        if gates[0] is not None and gates[1] is not None:
-            shown, modelled = (th.as_tensor(gate, device=self.device) > 0.0 for gate in gates)
+        if of_states is not None and of_actions is not None:
+            shown, modelled = of_states.to(self.device) > 0.0, of_actions.to(self.device) > 0.0
             with th.no_grad():
                 self._begin_anew(~shown, ~modelled, shown, modelled)
                 self.update_observation_statistics()

@@ -358,6 +358,36 @@ def test_where_no_state_is_known_to_matter_nothing_is_hidden():
     assert verdict.states.all() and verdict.actions.all() and verdict.withheld
 
 
+class Battery(gym.Wrapper):
+    """The last observation runs down by the second action, and ends the episode; it is in no reward."""
+
+    def reset(self, **kwargs):
+        observation, info = self.env.reset(**kwargs)
+        self.charge = 1.0
+        return self._with_charge(observation), info
+
+    def step(self, action):
+        observation, reward, _, truncated, info = self.env.step(action)
+        self.charge -= 0.1 + 0.1 * float(action[1])
+        return self._with_charge(observation), reward, self.charge < 0.0, truncated, info
+
+    def _with_charge(self, observation):
+        return np.array([*observation[:-1], self.charge])
+
+
+@pytest.mark.parametrize("efficient", [False, True])
+def test_what_ends_episodes_matters(efficient):
+    memory = {"optimize_memory_usage": True, "replay_buffer_kwargs": {"handle_timeout_termination": False}}
+    kwargs = {"batch_size": 4, "train_freq": 100, "causal_refresh_freq": 500, **(memory if efficient else {})}
+    model = CausalGDP("MlpPolicy", Battery(Cart()), causal_abstraction=True, **{**SMALL, **kwargs}).learn(2000)
+    assert model.relevance_gate.states[-1] and model.relevance_gate.actions[1]
+    assert not model.relevance_gate.states.all()
+    # By the rewards alone it would be hidden
+    for _ in range(2):
+        verdict = model.judge_relevance(model.causal_graph())
+    assert not verdict.states[-1] and not verdict.actions[1]
+
+
 def test_goals_are_never_hidden():
     model = CausalGDP("MultiInputPolicy", GoalEnv(), causal_abstraction=True, replay_buffer_class=HerReplayBuffer, **SMALL)
     variables = model.transition_variables

@@ -26,6 +26,7 @@ LAYERS = [
     {"causal.plots", "causal.sources", "causal.guidance"},
     {"causal.transitions", "causal.discovery", "causal.interventions"},
     {"causal.world_model", "causal.statistics"},
+    {"causal.endings"},
     {"causal.graph"},
     {"causal.rows"},
     {"causal.answers", "causal.description", "causal.relevance"},

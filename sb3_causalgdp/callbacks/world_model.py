@@ -16,6 +16,7 @@ from stable_baselines3.common.type_aliases import PyTorchObs
 from sb3_causalgdp.callbacks.diagnostics import choice, guidance_divergence, step_size_bound
 from sb3_causalgdp.causal import Verdict, min_rows
 from sb3_causalgdp.causal.description import count_of_edges
+from sb3_causalgdp.causal.endings import states_that_end
 
 
 class CausalWorldModelCallback(BaseCallback):
@@ -39,6 +40,7 @@ class CausalWorldModelCallback(BaseCallback):
     FEED_IMAGE_ROWS = 256
     HISTORY_ROWS = 20_000
     OFFLINE_HISTORY_ROWS = 100_000
+    ENDS_COMPARED = 2_000
 
     def __init__(
         self,
@@ -94,9 +96,8 @@ class CausalWorldModelCallback(BaseCallback):
         graph = model.discovery(statistics, variables, model._causal_graph)
         graph = replace(graph, num_timesteps=int(model.n_environment_steps))
         model.set_causal_graph(graph)
-        verdict = model.judge_relevance(graph)
-        if verdict is not None:
-            self._report_verdict(verdict)
+        if model.relevance_gate is not None:
+            self._report_verdict(model.judge_relevance(graph, self._states_that_end()))
         self.logger.record("causal/n_edges", graph.n_edges)
         self.logger.record("causal/expected_edges", graph.expected_edges)
         self.logger.record("causal/change", graph.change_since(before))
@@ -104,6 +105,26 @@ class CausalWorldModelCallback(BaseCallback):
         if self.verbose >= 1:
             print(f"Causal graph at {model.num_timesteps} steps: {count_of_edges(graph)}, from {graph.n_samples} transitions")
         self._log_diagnostics()
+
+    def _states_that_end(self) -> np.ndarray:
+        """Which states are others where episodes terminate, shape ``(n,)``."""
+        n_states = self.model.transition_variables.n_states
+        ends = np.zeros(n_states, dtype=bool)
+        for buffer in {self.model.replay_buffer, self.model.offline_buffer} - {None}:
+            n_held, n_envs = buffer.size(), buffer.n_envs
+            if n_held == 0:
+                continue
+            terminated = buffer.dones[:n_held] > 0.0
+            if hasattr(buffer, "timeouts"):
+                terminated &= buffer.timeouts[:n_held] == 0.0
+            # The memory efficient buffer does not keep the last observation of an episode
+            values = buffer.observations if buffer.optimize_memory_usage else buffer.next_observations
+            positions = np.flatnonzero(terminated.any(axis=1))[-self.ENDS_COMPARED :]
+            last = self._states(values, positions).reshape(len(positions), n_envs, n_states)[terminated[positions]]
+            n_usual = min(n_held, max(1, self.ENDS_COMPARED // n_envs))
+            usual = self._states(values, np.linspace(0, n_held - 1, n_usual).astype(np.int64))
+            ends |= states_that_end(usual, last)
+        return ends
 
     def _report_verdict(self, verdict: Verdict) -> None:
         self.logger.record("causal/n_closed_states", int((~verdict.states).sum()))

@@ -271,6 +271,10 @@ def _graph_section(model: CausalGDP) -> Section:
     ]
     if graph.constant_variables:
         remarks.append(f"Never moved, and have no edges: {', '.join(graph.constant_variables)}.")
+    if model.relevance_gate is not None:
+        gate = model.relevance_gate
+        hidden = [name for name, shown in zip(gate.names, (*gate.states, *gate.actions), strict=True) if not shown]
+        remarks.append(f"Hidden from actor and critics: {', '.join(hidden) or 'nothing'}.")
     for group in graph.duplicated_variables:
         remarks.append(f"Are linear functions of each other, and share their masks: {', '.join(group)}.")
     remarks += [f"{remark}." for remark in graph.remarks]
@@ -287,16 +291,20 @@ def _graph_section(model: CausalGDP) -> Section:
             f"The {min(MOST_EDGES, len(rows))} strongest of {len(rows)} edges",
             folded=True,
         ),
-        _relevance_table(graph),
+        _relevance_table(graph, model),
     ]
     return Section(title, remarks, pictures, tables=tables)
 
 
-def _relevance_table(graph: CausalGraph) -> Table:
-    rows = graph.relevance().rows()
+def _relevance_table(graph: CausalGraph, model: CausalGDP) -> Table:
+    rows, gate = graph.relevance().rows(), model.relevance_gate
+    is_open = {} if gate is None else dict(zip(gate.names, (*gate.states, *gate.actions), strict=True))
     return Table(
-        ("variable", "relevance", "edges", "surest path"),
-        [(name, f"{value:.2f}", str(length or "-"), path or "-") for name, value, length, path in rows[:MOST_EDGES]],
+        ("variable", "relevance", "edges", "surest path", "for the policy"),
+        [
+            (name, f"{value:.2f}", str(length or "-"), path or "-", "shown" if is_open.get(name, True) else "hidden")
+            for name, value, length, path in rows[:MOST_EDGES]
+        ],
         f"What can matter for any future reward: {min(MOST_EDGES, len(rows))} of {len(rows)} variables. {ASSUMPTION}",
         folded=True,
     )

@@ -21,6 +21,9 @@ pytest.importorskip("rl_zoo3")
 pytest.importorskip("matplotlib")
 from PIL import Image
 
+from sb3_causalgdp import CausalGDP
+from sb3_causalgdp.causal import CausalGraph
+from sb3_causalgdp.zoo.report_sections import _graph_section
 from sb3_causalgdp.zoo.run_folder import RunFolder, find_runs
 
 SECTIONS = [
@@ -435,3 +438,15 @@ def test_one_page_is_about_one_run(fails, run):
     shutil.copytree(run, run.with_name("Hopper-v5_1"))
     assert "-o is for one run, but" in fails(run.parent, "-o", "page.html")
     assert fails(run, "--episodes", -1) == "--episodes must be at least 0, got -1"
+
+
+def test_it_says_what_is_hidden_from_the_policy():
+    model = CausalGDP("MlpPolicy", "Pendulum-v1", causal_abstraction={"patience": 1}, device="cpu")
+    masks = np.array([[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 1], [0, 0, 1, 0]], dtype=float)
+    graph = CausalGraph(model.transition_variables, masks, np.zeros_like(masks), method="by hand", n_samples=1000)
+    model.set_causal_graph(graph)
+    model.judge_relevance(graph)
+    section = _graph_section(model)
+    assert "Hidden from actor and critics: obs[0], obs[1]." in section.remarks
+    shown = {row[0]: row[-1] for row in section.tables[-1].rows}
+    assert shown == {"obs[0]": "hidden", "obs[1]": "hidden", "obs[2]": "shown", "action[0]": "shown"}
