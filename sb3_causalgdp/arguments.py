@@ -309,7 +309,7 @@ CONSTRUCTOR_ARGUMENTS: dict[str, Kind] = {
     "replay_buffer_class": subclass(ReplayBuffer, "a subclass of ReplayBuffer") | NONE,
     "replay_buffer_kwargs": KEYWORDS | NONE,
     "optimize_memory_usage": FLAG,
-    "n_steps": integer(1, MOST_CANDIDATES) | choice(["auto"]),
+    "n_steps": integer(1, MOST_CANDIDATES),
     "critic_learning_rate": RATE | NONE,
     "world_model_learning_rate": RATE,
     "eta": WEIGHT,

@@ -9,7 +9,7 @@ from typing import Any, ClassVar, TypeVar
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy, ContinuousCritic
@@ -36,7 +36,6 @@ from sb3_causalgdp.distillation import distil
 from sb3_causalgdp.divergence import TrainingDivergedError, check_losses
 from sb3_causalgdp.offline.algorithm import callback_list
 from sb3_causalgdp.offline.preload import normalised_parts
-from sb3_causalgdp.offline.replay import SpacesEnv
 from sb3_causalgdp.policies import CausalGDPPolicy, CnnPolicy, DiffusionActor, MlpPolicy, MultiInputPolicy
 from sb3_causalgdp.questions import AskedAlgorithm
 from sb3_causalgdp.saving.algorithm import SavedAlgorithm
@@ -75,8 +74,7 @@ class CausalGDP(AskedAlgorithm, SavedAlgorithm):
     :param replay_buffer_kwargs: Keyword arguments to pass to the replay buffer on creation.
     :param optimize_memory_usage: Enable a memory efficient variant of the replay buffer at a cost of more complexity.
     :param n_steps: When n_step > 1, uses n-step return (with the NStepReplayBuffer) when updating the Q-value network; the
-        world model still learns from single steps. ``"auto"`` is 3 where SB3 has such a buffer and there is an environment to
-        learn from, and 1 for Dict observations, a ``replay_buffer_class``, ``optimize_memory_usage`` and datasets
+        world model still learns from single steps.
     :param critic_learning_rate: Learning rate of the critics, a number or a schedule; None takes ``learning_rate``
     :param world_model_learning_rate: Learning rate of the world model, a number or a schedule
     :param eta: Weight of the Q term in the policy loss (the paper's table: 0.005 to 5)
@@ -178,15 +176,13 @@ class CausalGDP(AskedAlgorithm, SavedAlgorithm):
     # What a gradient step does: a subclass may have its own
     updates_class: ClassVar[type[Updates]] = Updates
 
-    AUTO_N_STEPS = 3
-
     def __init__(
         self,
         policy: str | type[CausalGDPPolicy],
         env: GymEnv | str,
         learning_rate: float | Schedule = 1e-3,
         buffer_size: int = 1_000_000,  # 1e6
-        learning_starts: int = 100,
+        learning_starts: int = 1_000,
         batch_size: int = 256,
         tau: float = 0.005,
         gamma: float = 0.99,
@@ -196,11 +192,11 @@ class CausalGDP(AskedAlgorithm, SavedAlgorithm):
         replay_buffer_class: type[ReplayBuffer] | None = None,
         replay_buffer_kwargs: dict[str, Any] | None = None,
         optimize_memory_usage: bool = False,
-        n_steps: int | str = "auto",
+        n_steps: int = 1,
         critic_learning_rate: float | Schedule | None = None,
         world_model_learning_rate: float | Schedule = 1e-3,
         eta: float = 1.0,
-        denoising_weight: float = 0.05,
+        denoising_weight: float = 0.01,
         actor_update: str = "one_step",
         q_scale: str = "value",
         expectile: float | None = None,
@@ -269,7 +265,7 @@ class CausalGDP(AskedAlgorithm, SavedAlgorithm):
             replay_buffer_class=replay_buffer_class,
             replay_buffer_kwargs=replay_buffer_kwargs,
             optimize_memory_usage=optimize_memory_usage,
-            n_steps=1 if n_steps == "auto" else n_steps,  # type: ignore[arg-type]
+            n_steps=n_steps,
             policy_kwargs=policy_kwargs,
             stats_window_size=stats_window_size,
             tensorboard_log=tensorboard_log,
@@ -284,7 +280,6 @@ class CausalGDP(AskedAlgorithm, SavedAlgorithm):
             offline_fraction=offline_fraction,
             reward_transform=reward_transform,
         )
-        self._chooses_n_steps = n_steps == "auto"
         self._has_first_defaults = False
         self.critic_learning_rate = critic_learning_rate
         self.world_model_learning_rate = world_model_learning_rate
@@ -331,17 +326,7 @@ class CausalGDP(AskedAlgorithm, SavedAlgorithm):
             self._setup_model()
             self._updates.fast.check_recordable()
 
-    def _choose_n_steps(self) -> None:
-        # A loaded model's is chosen, and saved with its buffer's class
-        if not self._chooses_n_steps or self.replay_buffer_class is not None:
-            return
-        is_dict, is_offline = isinstance(self.observation_space, spaces.Dict), isinstance(self.env, SpacesEnv)
-        plain = is_dict or is_offline or self.optimize_memory_usage or self.offline_dataset is not None
-        fits = self.buffer_size // self.n_envs >= self.AUTO_N_STEPS
-        self.n_steps = self.AUTO_N_STEPS if fits and not plain else 1
-
     def _setup_model(self) -> None:
-        self._choose_n_steps()
         if self._has_first_defaults:
             self.policy_kwargs = with_first_defaults(self.policy_kwargs)
         self._check_arguments()
@@ -400,8 +385,8 @@ class CausalGDP(AskedAlgorithm, SavedAlgorithm):
                 raise ValueError(f"n_steps must be at most {n_positions}, buffer_size / n_envs, got {self.n_steps}")
         if self.optimize_memory_usage and n_positions < 2:
             raise ValueError(f"buffer_size must be at least 2 n_envs with optimize_memory_usage, got {self.buffer_size}")
-        if self.replay_buffer_class is not None or self.n_steps == 1:
-            check_keywords("replay_buffer_kwargs", self.replay_buffer_kwargs, self.replay_buffer_class or ReplayBuffer)
+        buffer_class = self.replay_buffer_class or (ReplayBuffer if self.n_steps == 1 else NStepReplayBuffer)
+        check_keywords("replay_buffer_kwargs", self.replay_buffer_kwargs, buffer_class)
 
     def _own_policy_kwargs(self) -> dict[str, Any]:
         names = (

@@ -169,7 +169,7 @@ def test_numbers_of_numpy_become_pythons():
         tau=np.float64(0.1),
         max_q_backup=np.bool_(True),
         guidance_scale=np.ones(5),
-        **in_policy(net_arch=np.array([16]), n_critics=np.int64(3)),
+        **in_policy(net_arch=np.array([16]), n_critics=np.int64(3), critic_normalization="layer"),
     )
     stored = (model.batch_size, model.policy_delay, model.train_freq.frequency, model.seed, model.eta, model.max_q_backup)
     assert stored == (8, 2, 4, 3, 0.5, True)

@@ -156,7 +156,7 @@ def test_the_actor_alone_predicts_without_noise_when_asked_to(trained, observati
 
 @pytest.mark.parametrize("extractor", ["batch norm and dropout", "shared"])
 def test_targets_copy_batch_norm_statistics_and_stay_in_evaluation_mode(extractor):
-    model = train(policy_kwargs=EXTRACTORS[extractor], tau=0.0)
+    model = train(policy_kwargs={**EXTRACTORS[extractor], "critic_normalization": None}, tau=0.0)
     for online, target in ((model.actor, model.actor_target), (model.critic, model.critic_target)):
         statistics = batch_norm_statistics(online)
         assert statistics["features_extractor.layers.1.num_batches_tracked"] > 0
@@ -181,7 +181,7 @@ def test_collecting_leaves_batch_norm_statistics_alone():
 
 
 def test_shared_features_are_the_same_module():
-    model = train(total_timesteps=32, policy_kwargs=EXTRACTORS["shared"])
+    model = train(total_timesteps=32, policy_kwargs={**EXTRACTORS["shared"], "critic_normalization": None})
     assert model.actor.features_extractor is model.critic.features_extractor
     assert model.actor_target.features_extractor is model.critic_target.features_extractor
     assert model.actor.features_extractor is not model.actor_target.features_extractor

@@ -128,7 +128,7 @@ def test_bounds_of_the_actions_are_those_of_the_environment():
 @pytest.mark.parametrize(
     "kwargs",
     [
-        {"max_q_backup": True},
+        {"max_q_backup": True, "policy_kwargs": {**SMALL["policy_kwargs"], "critic_normalization": None}},
         {"max_grad_norm": 1.0},
         {"guidance": None},
         {"guidance": "score", "guidance_scale": 1e-3},
@@ -148,7 +148,7 @@ def test_bounds_of_the_actions_are_those_of_the_environment():
         {"causal_half_life": 50.0, "causal_discovery_kwargs": {"threshold": 0.1}},
         {"denoising_weight": 0.0},
         {"eta": 0.0},
-        {"max_q_backup": True, "n_steps": 2},
+        {"max_q_backup": True, "n_steps": 2, "policy_kwargs": {**SMALL["policy_kwargs"], "critic_normalization": "layer"}},
     ],
     ids=str,
 )
@@ -168,7 +168,8 @@ def test_number_of_critics(n_critics):
 
 def test_layer_norm_of_the_critics_bounds_their_values():
     plain, normalised = (
-        learn(policy_kwargs={**SMALL["policy_kwargs"], "critic_normalization": kind}) for kind in (None, "layer")
+        learn(policy_kwargs={**SMALL["policy_kwargs"], "critic_normalization": kind, "normalize_observations": False})
+        for kind in (None, "layer")
     )
     n_layers = len(SMALL["policy_kwargs"]["net_arch"])
     for critic in (normalised.critic, normalised.critic_target):
@@ -324,7 +325,10 @@ def test_with_n_step_returns_the_world_model_learns_from_single_steps(kwargs, n_
 
 
 def test_with_n_step_returns_the_guidance_asks_for_the_next_step(monkeypatch):
-    model = SpyingGDP("MlpPolicy", CountingEnv(), **{**SMALL, "n_steps": 3, "policy_delay": 1})
+    policy_kwargs = {**SMALL["policy_kwargs"], "normalize_observations": False}
+    model = SpyingGDP(
+        "MlpPolicy", CountingEnv(), **{**SMALL, "n_steps": 3, "policy_delay": 1, "policy_kwargs": policy_kwargs}
+    )
     model.learn(80, callback=guided_callback())
     asked = []
     make_guidance = model.policy.make_guidance

@@ -25,6 +25,9 @@ KWARGS = {
 }
 
 
+AS_THEY_ARE = {"critic_normalization": None, "normalize_observations": False}
+
+
 def trained_model(policy="MlpPolicy", env="Pendulum-v1", **kwargs):
     """A model whose guidance is on, just before its next gradient step."""
     model = CausalGDP(policy, env, **{**KWARGS, **kwargs})
@@ -44,7 +47,7 @@ def dictionary_pendulum():
 
 
 def test_the_guidance_in_the_loss_climbs_one_critic_and_in_acting_the_smallest():
-    policy = trained_model().policy
+    policy = trained_model(policy_kwargs={**KWARGS["policy_kwargs"], **AS_THEY_ARE}).policy
     states, actions = th.randn(64, 3), th.rand(64, 1) * 2.0 - 1.0
 
     def gradients(value):
@@ -307,7 +310,7 @@ COMPILABLE = {
     "one critic": {"policy_kwargs": {"net_arch": [8], "n_critics": 1}},
     "layer norm": {"policy_kwargs": {"net_arch": [8], "critic_normalization": "layer"}},
     "clipped": {"max_grad_norm": 0.1},
-    "max_q_backup": {"max_q_backup": True},
+    "max_q_backup": {"max_q_backup": True, "policy_kwargs": {"net_arch": [8], **AS_THEY_ARE}},
     "memory": {"optimize_memory_usage": True, "replay_buffer_kwargs": {"handle_timeout_termination": False}},
     "n steps": {"n_steps": 3},
 }
