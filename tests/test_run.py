@@ -326,9 +326,7 @@ def test_with_n_step_returns_the_world_model_learns_from_single_steps(kwargs, n_
 
 def test_with_n_step_returns_the_guidance_asks_for_the_next_step(monkeypatch):
     policy_kwargs = {**SMALL["policy_kwargs"], "normalize_observations": False}
-    model = SpyingGDP(
-        "MlpPolicy", CountingEnv(), **{**SMALL, "n_steps": 3, "policy_delay": 1, "policy_kwargs": policy_kwargs}
-    )
+    model = SpyingGDP("MlpPolicy", CountingEnv(), **{**SMALL, "n_steps": 3, "policy_delay": 1, "policy_kwargs": policy_kwargs})
     model.learn(80, callback=guided_callback())
     asked = []
     make_guidance = model.policy.make_guidance
