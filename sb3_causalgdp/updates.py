@@ -165,13 +165,13 @@ class Updates:
 
     @staticmethod
     def dealt(
-        plans: Sequence[StepPlan], replay_data: Any, one_step: Sequence[Any], next_actions: th.Tensor, target: th.Tensor
+        plans: Sequence[StepPlan], replay_data: Any, one_step: Sequence[Any], next_actions: th.Tensor | None, target: th.Tensor
     ) -> Iterator[tuple[StepPlan, StepBatch]]:
         """
         :param plans: Of some gradient steps
         :param replay_data: Batches of the critics, one behind the other
         :param one_step: A batch for each step that trains more than the critics, none if ``replay_data`` is for all
-        :param next_actions: After ``replay_data``
+        :param next_actions: After ``replay_data``, None if they are not known yet
         :param target: TD target of ``replay_data``
         :return: Each plan with its batch
         """
@@ -180,7 +180,7 @@ class Updates:
             rows = slice(index * batch_size, (index + 1) * batch_size)
             own = rows_of(replay_data, rows)
             single = next(of_others, None) if plan.trains_others else None
-            others = (own, next_actions[rows]) if single is None else (single, None)
+            others = (single, None) if single is not None else (own, None if next_actions is None else next_actions[rows])
             yield plan, StepBatch(own, target[rows], *others)
 
     def beside_critics(self) -> Callable[[], AbstractContextManager[None]]:
@@ -191,24 +191,24 @@ class Updates:
 
     # Critics --------------------------------------------------------------------------------------------------------------
 
-    def td_target(self, replay_data) -> tuple[th.Tensor, th.Tensor]:
+    def td_target(self, replay_data) -> tuple[th.Tensor | None, th.Tensor]:
         """
         :param replay_data: Sample of a replay buffer
-        :return: Actions in the next states, shape ``(batch, d)``; and the TD target with them, shape ``(batch, 1)``, or, where
-            critics normalise batches, the actions of which they say it themselves, shape ``(batch, d)``
+        :return: Actions in the next states, shape ``(batch, d)``, None where a value network is asked; and the TD target with
+            them, shape ``(batch, 1)``, or, where critics normalise batches, the actions of which they say it themselves, shape
+            ``(batch, d)``
         """
         n_actions = self.N_BACKUP_ACTIONS if self.model.max_q_backup else 1
         next_observations = replay_data.next_observations
         actor = self.actor if self.critic.normalizes_batches else self.actor_target
         with th.no_grad():
+            if self.model.expectile is not None:
+                values = [self.critic.value(next_observations)]
+                return None, td_target(values, replay_data.rewards, replay_data.dones, self.discounts(replay_data))
             actor_features = actor.features(next_observations).repeat_interleave(n_actions, dim=0)
             next_actions = actor.sample(actor_features)
             if self.critic.normalizes_batches:
                 return next_actions, self.smoothed(next_actions)
-            if self.model.expectile is not None:
-                values = [self.critic.value(next_observations)]
-                target = td_target(values, replay_data.rewards, replay_data.dones, self.discounts(replay_data))
-                return next_actions[::n_actions], target
             critic_features = self.critic_target.extract_features(next_observations, self.critic_target.features_extractor)
             critic_features, smoothed = critic_features.repeat_interleave(n_actions, dim=0), self.smoothed(next_actions)
             next_q_values = q_values(self.critic_target, critic_features, smoothed)
