@@ -359,7 +359,7 @@ def _write_exported_program(
 def _write_onnx(
     program: GraphModule, acting: ExportedPolicy, arrays: Arrays, metadata: str, path: Path
 ) -> Callable[[Arrays], np.ndarray] | None:
-    names = acting.input_names
+    names, rule = acting.input_names, acting.policy.guidance_rule
     exported = th.onnx.export(
         _exported_program(program, acting, arrays),
         input_names=names,
@@ -367,10 +367,13 @@ def _write_onnx(
         dynamo=True,
         external_data=False,
         verbose=False,
+        # onnxscript 0.7's optimizer removes an operator that the denoiser's Jacobian needs
+        optimize=not (acting.guided and rule.needs_jacobian),
     )
     assert exported is not None
     exported.model.metadata_props[METADATA] = metadata
     exported.save(path)
+    importlib.import_module("onnx").checker.check_model(path)
     try:
         runtime = importlib.import_module("onnxruntime")
     except ImportError:

@@ -96,18 +96,22 @@ def observations():
     return np.stack([np.cos(angle), np.sin(angle), np.linspace(-4.0, 4.0, 7)], axis=1).astype(np.float32)
 
 
+@pytest.fixture(scope="module", params=SUFFIXES)
+def exported(request, pendulum, tmp_path_factory):
+    path = tmp_path_factory.mktemp("exported") / f"policy{request.param}"
+    pendulum.export(path)
+    return path
+
+
 # The same actions -------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("suffix", SUFFIXES)
-def test_a_file_acts_as_the_model_at_any_batch_size(suffix, pendulum, observations, tmp_path):
-    path = tmp_path / f"policy{suffix}"
-    pendulum.export(path)
+def test_a_file_acts_as_the_model_at_any_batch_size(exported, pendulum, observations):
     expected, _ = pendulum.predict(observations, deterministic=True)
     assert np.ptp(expected) > 0.1
-    np.testing.assert_allclose(run(path, observations), expected, atol=TOLERANCE)
-    np.testing.assert_allclose(run(path, observations[:1]), expected[:1], atol=TOLERANCE)
-    metadata = metadata_of(path)
+    np.testing.assert_allclose(run(exported, observations), expected, atol=TOLERANCE)
+    np.testing.assert_allclose(run(exported, observations[:1]), expected[:1], atol=TOLERANCE)
+    metadata = metadata_of(exported)
     assert metadata["guided"] and metadata["deterministic"] and not metadata["normalizes_observations"]
     assert metadata["inputs"] == [{"name": "observation", "dtype": "float32", "shape": ["batch", 3]}]
     assert metadata["action"] == {"shape": ["batch", 1], "low": [-2.0], "high": [2.0]}
@@ -143,11 +147,10 @@ def test_noise_is_an_input_of_what_is_not_deterministic(exploration_noise, obser
     assert names == ["observation", "noise", "exploration_noise"][: 2 + len(exploration)]
 
 
-@pytest.mark.parametrize("suffix", [".pt", pytest.param(".onnx", marks=needs_onnx)])
-def test_normalisation_of_observations_is_inside(suffix, observations, tmp_path):
+def test_normalisation_of_observations_is_inside(observations, tmp_path):
     env = VecNormalize(make_vec_env("Pendulum-v1", n_envs=2, seed=0), clip_obs=1.5)
     model = trained(env, critic_learning_rate=1e-3)
-    path = tmp_path / f"policy{suffix}"
+    path = tmp_path / "policy.pt"
     model.export(path)
     normalised = env.normalize_obs(observations)
     assert (np.abs(normalised) == 1.5).any()
@@ -230,12 +233,11 @@ def test_observations_that_are_no_vectors(kind, tmp_path):
     np.testing.assert_allclose(run(tmp_path / "policy.pt", rows(space, 5)), expected, atol=TOLERANCE)
 
 
-@pytest.mark.parametrize("suffix", [".pt2", pytest.param(".onnx", marks=needs_onnx)])
-def test_each_part_of_a_dictionary_is_an_input(suffix, tmp_path):
+def test_each_part_of_a_dictionary_is_an_input(tmp_path):
     # Not in the alphabet's order, which SB3 keeps
     parts = {"b": spaces.Box(-1.0, 1.0, (2,), np.float32), "a": spaces.Discrete(3)}
     model = trained(Sums(spaces.Dict(parts)), "MultiInputPolicy")
-    path = tmp_path / f"policy{suffix}"
+    path = tmp_path / "policy.pt"
     model.export(path)
     inputs = {key: rows(space, 5) for key, space in model.observation_space.spaces.items()}
     expected, _ = model.predict(inputs, deterministic=True)
@@ -357,12 +359,10 @@ sys.meta_path.insert(0, Refuse())
 """
 
 
-@pytest.mark.parametrize("suffix", SUFFIXES)
-def test_a_file_runs_without_this_package(suffix, pendulum, observations, tmp_path):
-    pendulum.export(tmp_path / f"policy{suffix}")
-    np.save(tmp_path / "observations.npy", observations)
-    runtime, others = ("onnxruntime", ["torch"]) if suffix == ".onnx" else ("torch", [])
-    code = BLOCK % others + ALONE.format(runtime=runtime, others=others, load=LOADERS[suffix])
-    subprocess.run([sys.executable, "-c", code], cwd=tmp_path, check=True, timeout=120)
+def test_a_file_runs_without_this_package(exported, pendulum, observations):
+    np.save(exported.with_name("observations.npy"), observations)
+    runtime, others = ("onnxruntime", ["torch"]) if exported.suffix == ".onnx" else ("torch", [])
+    code = BLOCK % others + ALONE.format(runtime=runtime, others=others, load=LOADERS[exported.suffix])
+    subprocess.run([sys.executable, "-c", code], cwd=exported.parent, check=True, timeout=120)
     expected, _ = pendulum.predict(observations, deterministic=True)
-    np.testing.assert_allclose(np.load(tmp_path / "actions.npy"), expected, atol=TOLERANCE)
+    np.testing.assert_allclose(np.load(exported.with_name("actions.npy")), expected, atol=TOLERANCE)
