@@ -58,11 +58,11 @@ def q_values(
     :param networks: Which of the networks, all by default
     :return: One tensor of shape ``(batch, 1)`` for each network
     """
-    inputs = th.cat([features, modelled(critic, actions)], dim=1)
+    inputs = th.cat([features, _modelled(critic, actions)], dim=1)
     return [network(inputs) for network in critic.q_networks[networks]]
 
 
-def modelled(network: nn.Module, actions: th.Tensor) -> th.Tensor:
+def _modelled(network: nn.Module, actions: th.Tensor) -> th.Tensor:
     """
     :param network: An actor or critics
     :param actions: Shape ``(..., d)``
@@ -121,7 +121,7 @@ class Critic(PickledAlone, ContinuousCritic):
         self._batch_norms = tuple(module for module in modules if isinstance(module, nn.BatchNorm1d))
 
     def forward(self, obs: PyTorchObs, actions: th.Tensor) -> tuple[th.Tensor, ...]:
-        return super().forward(obs, modelled(self, actions))  # type: ignore[arg-type]  # SB3 gives dictionaries, too
+        return super().forward(obs, _modelled(self, actions))  # type: ignore[arg-type]  # SB3 gives dictionaries, too
 
     @property
     def normalizes_batches(self) -> bool:
@@ -310,7 +310,7 @@ class DiffusionActor(PickledAlone, BasePolicy):
         :return: Actions in [-1, 1], shape ``(batch, d)``
         """
         if self.one_pass is not None:
-            return modelled(self, self.one_pass(features))
+            return _modelled(self, self.one_pass(features))
         return self.denoise(features, noise, guidance, rule)
 
     def denoise(
@@ -335,7 +335,7 @@ class DiffusionActor(PickledAlone, BasePolicy):
             if noise is None:
                 shape = (self.n_noises, len(features), self.action_dim)
                 noise = th.randn(shape, dtype=features.dtype, device=features.device)
-            noise = modelled(self, noise)
+            noise = _modelled(self, noise)
         action = sample(
             self.denoiser,
             self.schedule,
@@ -350,7 +350,7 @@ class DiffusionActor(PickledAlone, BasePolicy):
             divergences=divergences,
         )
         # Guidance may have moved what is not modelled
-        return modelled(self, action)
+        return _modelled(self, action)
 
     def adapt(self, features: th.Tensor, action: th.Tensor) -> th.Tensor:
         """
@@ -362,9 +362,9 @@ class DiffusionActor(PickledAlone, BasePolicy):
         :return: Actions in [-1, 1], shape ``(batch, d)``
         """
         step = th.full(action.shape[:1], self.adapting_step, device=action.device)
-        noisy = self.schedule.add_noise(modelled(self, action), th.zeros_like(action), step)
+        noisy = self.schedule.add_noise(_modelled(self, action), th.zeros_like(action), step)
         clean = self.schedule.clean_estimate(noisy, bind(self.denoiser, features)(noisy, step), step).clamp(-1.0, 1.0)
-        return modelled(self, clean)
+        return _modelled(self, clean)
 
     def forward(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         features = self.features(observation)

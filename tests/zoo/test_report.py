@@ -447,6 +447,6 @@ def test_it_says_what_is_hidden_from_the_policy():
     model.set_causal_graph(graph)
     model.judge_relevance(graph)
     section = _graph_section(model)
-    assert "Hidden from actor and critics: obs[0], obs[1]." in section.remarks
+    assert "Hidden from actor and critics: cos angle, sin angle." in section.remarks
     shown = {row[0]: row[-1] for row in section.tables[-1].rows}
-    assert shown == {"obs[0]": "hidden", "obs[1]": "hidden", "obs[2]": "shown", "action[0]": "shown"}
+    assert shown == {"cos angle": "hidden", "sin angle": "hidden", "vel angle": "shown", "torque": "shown"}
