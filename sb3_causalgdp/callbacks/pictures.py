@@ -21,7 +21,7 @@ from sb3_causalgdp.causal.plots import View, plot_action_effects, plot_causal_gr
 from sb3_causalgdp.causal.plots.figures import FONT_SIZE, check_choice, save_figure
 from sb3_causalgdp.causal.plots.graphs import KINDS
 from sb3_causalgdp.causal.plots.view import view_of
-from sb3_causalgdp.knowledge import DiscoveringAlgorithm
+from sb3_causalgdp.questions import AskedAlgorithm
 from sb3_causalgdp.policies import CausalGDPPolicy
 
 try:
@@ -59,7 +59,7 @@ class CausalPicturesCallback(BaseCallback):
     :raises ValueError: If a number is below 1, or a field of the view is not known or out of range
     """
 
-    model: DiscoveringAlgorithm
+    model: AskedAlgorithm
     # Before the first time is known
     EXPECTED_SECONDS = 1.0
 
@@ -91,7 +91,7 @@ class CausalPicturesCallback(BaseCallback):
         self._expected = self.EXPECTED_SECONDS
 
     def _init_callback(self) -> None:
-        if not isinstance(self.model, DiscoveringAlgorithm):
+        if not isinstance(self.model, AskedAlgorithm):
             raise TypeError(f"CausalPicturesCallback draws a CausalGDP, got {type(self.model).__name__}")
         self._last_steps = self.model.num_timesteps
 
@@ -146,7 +146,7 @@ class CausalPicturesCallback(BaseCallback):
             # A loaded model starts with an empty buffer
             return
         observations, actions = draw_transitions(buffer, model.policy, self.batch_size)
-        if model.world_model.n_batches > 0:
+        if model.policy.world_model.n_batches > 0:
             yield "effects", lambda path: plot_action_effects(model.effect_of_actions(observations, actions), path)
         if model.policy.is_guided:
             divergences = step_divergences(model.policy, policy_input(model, observations)).cpu()
@@ -221,7 +221,7 @@ def draw_transitions(
     return observations, policy.unscale_action(actions)
 
 
-def policy_input(model: DiscoveringAlgorithm, observations: np.ndarray | dict[str, np.ndarray]) -> PyTorchObs:
+def policy_input(model: AskedAlgorithm, observations: np.ndarray | dict[str, np.ndarray]) -> PyTorchObs:
     """
     :param model: The model
     :param observations: A batch of observations, as the environment gives them
@@ -233,7 +233,7 @@ def policy_input(model: DiscoveringAlgorithm, observations: np.ndarray | dict[st
 
 
 @contextmanager
-def _undisturbed(model: DiscoveringAlgorithm) -> Iterator[None]:
+def _undisturbed(model: AskedAlgorithm) -> Iterator[None]:
     """What is drawn from torch's generators inside was not drawn, and the policy is in evaluation mode for a while."""
     was_training = model.policy.training
     devices = [model.device] if model.device.type == "cuda" else []
