@@ -176,7 +176,7 @@ class CausalGDP(AskedAlgorithm, SavedAlgorithm):
         env: GymEnv | str,
         learning_rate: float | Schedule = 1e-3,
         buffer_size: int = 1_000_000,  # 1e6
-        learning_starts: int = 100,
+        learning_starts: int = 1_000,
         batch_size: int = 256,
         tau: float = 0.005,
         gamma: float = 0.99,
@@ -190,7 +190,7 @@ class CausalGDP(AskedAlgorithm, SavedAlgorithm):
         critic_learning_rate: float | Schedule | None = None,
         world_model_learning_rate: float | Schedule = 1e-3,
         eta: float = 1.0,
-        denoising_weight: float = 0.05,
+        denoising_weight: float = 0.01,
         actor_update: str = "one_step",
         q_scale: str = "value",
         bound_penalty: float = 0.1,

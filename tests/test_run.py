@@ -317,14 +317,16 @@ def test_with_n_step_returns_the_world_model_learns_from_single_steps(kwargs, n_
 
 
 def test_with_n_step_returns_the_guidance_asks_for_the_next_step(monkeypatch):
-    model = SpyingGDP("MlpPolicy", CountingEnv(), **{**SMALL, "n_steps": 3, "policy_delay": 1})
+    policy_kwargs = {**SMALL["policy_kwargs"], "normalize_observations": False}
+    model = SpyingGDP(
+        "MlpPolicy", CountingEnv(), **{**SMALL, "n_steps": 3, "policy_delay": 1, "policy_kwargs": policy_kwargs}
+    )
     model.learn(80, callback=guided_callback())
     asked = []
     make_guidance = model.policy.make_guidance
     monkeypatch.setattr(model.policy, "make_guidance", lambda *args: asked.append(args) or make_guidance(*args))
     # The action that follows is the target's for that next state
     monkeypatch.setattr(model.actor_target, "sample", lambda features: features / 1000.0)
-    model.policy.update_observation_statistics = lambda: None
     model.train(gradient_steps=4, batch_size=8)
     for (state, next_state, next_action, critic), (transitions, next_actions) in zip(
         asked, model._updates.seen["actor"][-4:], strict=True
