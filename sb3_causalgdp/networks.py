@@ -78,7 +78,7 @@ class Critic(PickledAlone, ContinuousCritic):
     def __init__(self, normalization: str | None = None, value_network: bool = False, **kwargs: Any) -> None:
         super().__init__(**kwargs)
         n_inputs = kwargs["features_dim"] + get_action_dim(kwargs["action_space"])
-        norms: dict[str, list[Any]] = {}
+        norms: dict[str, Any] = {}
         if normalization == "layer":
             norms = {"post_linear_modules": [nn.LayerNorm]}
         elif normalization == "batch":
@@ -232,7 +232,8 @@ class DiffusionActor(PickledAlone, BasePolicy):
         )
         self.one_pass = None
         if one_pass:
-            layers = create_mlp(features_dim, self.action_dim, net_arch, fast(activation_fn), squash_output=True)
+            activation: Any = fast(activation_fn)
+            layers = create_mlp(features_dim, self.action_dim, net_arch, activation, squash_output=True)
             self.one_pass = nn.Sequential(*layers)
             make_layers_fast(self.one_pass)
 
