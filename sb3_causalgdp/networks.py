@@ -262,7 +262,8 @@ class DiffusionActor(PickledAlone, BasePolicy):
         )
         self.one_pass = None
         if one_pass:
-            layers = create_mlp(features_dim, self.action_dim, net_arch, fast(activation_fn), squash_output=True)  # type: ignore[arg-type]
+            activation: Any = fast(activation_fn)
+            layers = create_mlp(features_dim, self.action_dim, net_arch, activation, squash_output=True)
             self.one_pass = nn.Sequential(*layers)
             make_layers_fast(self.one_pass)
 

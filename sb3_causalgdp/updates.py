@@ -128,12 +128,12 @@ class Updates:
         """
         model = self.model
         # All that the steps depend on and that may change while it trains
-        of_terms = (model.eta, model.denoising_weight, model.bound_penalty, model.q_scale)
-        weights = (*of_terms, model.expectile, model.advantage_temperature, model.improvement_step)
+        weights = (model.eta, model.denoising_weight, model.bound_penalty, model.q_scale)
+        of_methods = (model.expectile, model.advantage_temperature, model.improvement_step)
         rates = (model.tau, model.gamma, model.max_grad_norm, model.target_policy_noise, model.target_noise_clip)
         scales = (self.policy.state_guidance_scale, self.policy.outcome_guidance_scale)
         with n_threads_at_most(model.torch_threads, self.policy.has_image_state):
-            yield self.fast.made_fast(gradient_steps, (weights, rates, scales))
+            yield self.fast.made_fast(gradient_steps, (weights, of_methods, rates, scales))
 
     def planned(self, gradient_steps: int, batch_size: int) -> Iterator[tuple[tuple[StepPlan, ...], list[Any]]]:
         """

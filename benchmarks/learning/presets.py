@@ -1,4 +1,4 @@
-"""Pendulum-v1 by each preset: python benchmarks/learning/presets.py NAME [--guided] [--seed N] [--steps N]"""
+"""Steps to a return of -170 on Pendulum-v1 by a preset: python benchmarks/learning/presets.py NAME [--guided] [--seed N]"""
 
 import argparse
 import json
@@ -18,7 +18,8 @@ def main() -> None:
     parser.add_argument("--guided", action="store_true")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--steps", type=int, default=20_000)
-    parser.add_argument("--every", type=int, default=5_000)
+    parser.add_argument("--every", type=int, default=2_500)
+    parser.add_argument("--until", type=float, default=-170.0)
     given = parser.parse_args()
     th.set_num_threads(1)
     model = CausalGDP("MlpPolicy", "Pendulum-v1", seed=given.seed, **preset(given.name, guided=given.guided))
@@ -33,6 +34,8 @@ def main() -> None:
         assert isinstance(mean, float) and isinstance(std, float)
         result = {"preset": given.name, "guided": given.guided, "seed": given.seed, "steps": model.num_timesteps}
         print(json.dumps({**result, "return": round(mean, 1), "std": round(std, 1), "seconds": round(seconds)}), flush=True)
+        if mean >= given.until:
+            break
 
 
 if __name__ == "__main__":
