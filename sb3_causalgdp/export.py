@@ -25,12 +25,13 @@ from torch.fx.node import map_arg
 
 from sb3_causalgdp.causal import TransitionVariables
 from sb3_causalgdp.files import replaced_when_done
+from sb3_causalgdp.hints import how_to_install
 from sb3_causalgdp.prediction import act_in_torch
 
 Policy = Any  # a CausalGDPPolicy, whose file imports this one
 Arrays = list[np.ndarray]
 
-EXPORT_HINT = 'pip install "sb3_causalgdp[export]"'
+EXPORT_HINT = how_to_install("export")
 METADATA = "metadata.json"
 """The key of what a file tells of itself, as JSON."""
 # A file whose actions typically differ by more, in half ranges of the action space, is not written

@@ -7,6 +7,7 @@ EXTRAS = {
     "offline": ("minari[hdf5]", "gymnasium-robotics"),
     "zoo": ("rl-zoo3>=2.7", "sb3-contrib", "requests", "seaborn", "moviepy", "jinja2"),
     "lingam": ("lingam",),
+    "export": ("onnx", "onnxscript", "onnxruntime"),
     "train": ("tqdm", "rich", "tensorboard"),
     "cluster": ("ray",),
 }

@@ -239,11 +239,11 @@ def test_dictionaries_of_observations():
     model = learn(DummyVecEnv([GoalPendulum]), "MultiInputPolicy")
     recorded = play(GoalPendulum())
     names = model.transition_variables.state_names
-    assert set(names) == {"place[0]", "place[1]", "speed[0]", "side[0]", "side[1]"}
-    single = model.intervene(recorded[0][0], recorded[1][0], {"speed[0]": 3.0, "place[1]'": 0.2})
+    assert set(names) == {"place[0]", "place[1]", "speed", "side[0]", "side[1]"}
+    single = model.intervene(recorded[0][0], recorded[1][0], {"speed": 3.0, "place[1]'": 0.2})
     assert single.next_state.shape == (5,) and single.next_state[names.index("place[1]")] == 0.2
     unchanged = model.counterfactual(recorded, {})
-    np.testing.assert_array_equal(unchanged.states[:, names.index("speed[0]")], [o["speed"][0] for o in recorded[0]])
+    np.testing.assert_array_equal(unchanged.states[:, names.index("speed")], [o["speed"][0] for o in recorded[0]])
     np.testing.assert_array_equal(unchanged.states[:, names.index("side[1]")], [o["side"] for o in recorded[0]])
     with pytest.raises(ValueError, match=r"torque must be in \[-2, 2\], got -3"):
         model.counterfactual(recorded, {TORQUE: -3.0})
@@ -256,7 +256,7 @@ def test_normalised_dictionaries_of_boxes():
     model = learn(env, "MultiInputPolicy")
     recorded = play(GoalPendulum(is_discrete=False))
     structural, names = model.structural_model(), model.transition_variables.state_names
-    expected = {"place[0]": 1.0, "place[1]": 1.0, "speed[0]": float(np.sqrt(env.obs_rms["speed"].var + env.epsilon)[0])}
+    expected = {"place[0]": 1.0, "place[1]": 1.0, "speed": float(np.sqrt(env.obs_rms["speed"].var + env.epsilon)[0])}
     np.testing.assert_allclose(structural.state_scale, [expected[name] for name in names])
     unchanged = model.counterfactual(recorded, {}, follow_policy=True)
     np.testing.assert_array_equal(unchanged.actions, np.array(recorded[1]))

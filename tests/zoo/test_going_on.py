@@ -94,7 +94,7 @@ def test_two_runs_that_start_at_once_have_a_folder_each(command, folder):
 
 
 def test_a_checkpoint_in_one_file_is_a_trained_agent(zoo, tiny, folder):
-    model = CausalGDP("MlpPolicy", "Pendulum-v1", seed=0, policy_kwargs={"net_arch": [8]}).learn(150)
+    model = CausalGDP("MlpPolicy", "Pendulum-v1", learning_starts=50, seed=0, policy_kwargs={"net_arch": [8]}).learn(150)
     model.save_checkpoint("there.zip")
     zoo("train", "--algo", "causalgdp", "--env", "Pendulum-v1", "-f", "logs", "-n", 130, "-i", "there.zip", *tiny[:6])
     other = CausalGDP.load("logs/causalgdp/Pendulum-v1_1/Pendulum-v1.zip")
