@@ -50,9 +50,9 @@ class CausalGDP(AskedAlgorithm, SavedAlgorithm):
     """
     Causality-Guided Diffusion Policy (CausalGDP).
 
-    Paper: "CausalGDP: Causality-Guided Diffusion Policies for Reinforcement Learning" (Xiao, Hu, Ye and Yue). The actor, its
-    loss and the critics are those of Diffusion-QL (https://arxiv.org/abs/2208.06193); without guidance
-    (``guidance=None`` or ``guidance_scale=0``) and with ``actor_update="chain"`` the algorithm is Diffusion-QL.
+    Paper: "CausalGDP: Causality-Guided Diffusion Policies for Reinforcement Learning" (Xiao, Hu, Ye and Yue). The actor and
+    its loss are those of Diffusion-QL (https://arxiv.org/abs/2208.06193), which is ``preset("diffusion_ql")``; the critics are
+    those of CrossQ (https://arxiv.org/abs/1902.05605).
 
     :param policy: The policy model to use (MlpPolicy, CnnPolicy, MultiInputPolicy)
     :param env: The environment to learn from (if registered in Gymnasium, can be str); actions must be a bounded Box
