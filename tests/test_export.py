@@ -296,7 +296,7 @@ def test_a_policy_that_predicts_otherwise_is_refused_and_the_old_file_stays(pend
 
 def test_without_onnx_the_error_says_what_to_install(pendulum, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "onnx", None)
-    with pytest.raises(ImportError, match=r'onnx is needed .* pip install onnx onnxscript onnxruntime'):
+    with pytest.raises(ImportError, match=r"onnx is needed .* pip install onnx onnxscript onnxruntime"):
         pendulum.export(tmp_path / "policy.onnx")
 
 
