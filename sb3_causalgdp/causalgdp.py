@@ -345,8 +345,9 @@ class CausalGDP(AskedAlgorithm, SavedAlgorithm):
         self.policy_kwargs = {**self._own_policy_kwargs(), **policy_kwargs, **check_arguments(POLICY_ARGUMENTS, policy_kwargs)}
         try:
             with warnings.catch_warnings():
-                # What SB3 says of each loaded model
-                warnings.filterwarnings("ignore", message="`n_steps=")
+                if self.replay_buffer_class is NStepReplayBuffer and self.replay_buffer_kwargs.get("n_steps") == self.n_steps:
+                    # SB3 chose both itself before the model was saved, and would say that n_steps is ignored
+                    warnings.filterwarnings("ignore", message="`n_steps=")
                 super()._setup_model()
         except MemoryError as error:
             raise ValueError(f"buffer_size={self.buffer_size} does not fit into memory: {error}") from error
@@ -355,14 +356,13 @@ class CausalGDP(AskedAlgorithm, SavedAlgorithm):
         if self.num_timesteps > 0 and self.seed is not None:
             # A loaded model would live through the random numbers and start states of its first steps again
             self.set_random_seed(fresh_seed(self))
-        if self.max_q_backup and self.policy.critic.normalizes_batches:
-            raise ValueError(
-                "max_q_backup must be False without target critics, got True: critic_normalization='layer' has them"
-            )
-        if self.expectile is not None and self.policy.critic.normalizes_batches:
-            raise ValueError(
-                f"expectile must be None without target critics, got {self.expectile}: critic_normalization='layer' has them"
-            )
+        if self.policy.critic.normalizes_batches:
+            for name, without in (("max_q_backup", False), ("expectile", None)):
+                value = getattr(self, name)
+                if value is not without:
+                    raise ValueError(
+                        f"{name} must be {without} without target critics, got {value}: critic_normalization='layer' has them"
+                    )
         self._create_aliases()
         self._setup_discovery()
 

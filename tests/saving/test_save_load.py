@@ -5,6 +5,7 @@ import os
 import pickle
 import subprocess
 import sys
+import warnings
 import zipfile
 from copy import deepcopy
 
@@ -274,6 +275,11 @@ def test_every_argument_is_an_attribute_and_survives():
     assert (policy.discount, policy.n_action_candidates, policy.guidance_rule.scales) == (0.9, 4, [0.1, 0.2, 0.3])
 
 
+def test_steps_that_a_buffer_of_ones_own_ignores_are_not_ignored_in_silence():
+    with pytest.warns(UserWarning, match="`n_steps=3` is ignored"):
+        CausalGDP("MlpPolicy", "Pendulum-v1", n_steps=3, replay_buffer_class=ReplayBuffer, buffer_size=100, device="cpu")
+
+
 def test_schedules_and_noise_survive():
     model = CausalGDP(
         "MlpPolicy",
@@ -288,7 +294,10 @@ def test_schedules_and_noise_survive():
     )
     stream = io.BytesIO()
     model.save(stream)
-    loaded = CausalGDP.load(stream, device="cpu", trusted=True)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", UserWarning)
+        # Not of a buffer class that SB3 has chosen itself before it was saved
+        loaded = CausalGDP.load(stream, device="cpu", trusted=True)
     rates = (loaded.lr_schedule(0.5), loaded.critic_lr_schedule(0.5), loaded.world_model_lr_schedule(0.5))
     np.testing.assert_allclose(rates, [5e-4, 1e-3, 1.5e-3])
     assert loaded.action_noise._sigma == pytest.approx(0.3)
