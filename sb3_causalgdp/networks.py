@@ -62,6 +62,16 @@ def q_values(
     return [network(inputs) for network in critic.q_networks[networks]]
 
 
+def smallest_q(critic: ContinuousCritic, features: th.Tensor, actions: th.Tensor) -> th.Tensor:
+    """
+    :param critic: The critics
+    :param features: Shape ``(batch, features_dim)``
+    :param actions: In [-1, 1], shape ``(batch, d)``
+    :return: The smallest of :func:`q_values`, shape ``(batch, 1)``
+    """
+    return th.cat(q_values(critic, features, actions), dim=1).amin(dim=1, keepdim=True)
+
+
 def _modelled(network: nn.Module, actions: th.Tensor) -> th.Tensor:
     """
     :param network: An actor or critics
@@ -137,11 +147,13 @@ class Critic(PickledAlone, ContinuousCritic):
     @contextmanager
     def batch_statistics(self) -> Iterator[None]:
         """Within it, batches are normalised by their own statistics, which enter the running ones."""
-        for module in self._batch_norms:
-            module.training = True
-        yield
-        for module in self._batch_norms:
-            module.training = False
+        try:
+            for module in self._batch_norms:
+                module.training = True
+            yield
+        finally:
+            for module in self._batch_norms:
+                module.training = False
 
     def value(self, observations: PyTorchObs) -> th.Tensor:
         """
@@ -158,7 +170,7 @@ class Critic(PickledAlone, ContinuousCritic):
         :return: The smallest Q, shape ``(batch, 1)``
         """
         features = self.extract_features(observations, self.features_extractor)
-        return th.cat(q_values(self, features, actions), dim=1).amin(dim=1, keepdim=True)
+        return smallest_q(self, features, actions)
 
     def forward_both(
         self, observations: PyTorchObs, actions: th.Tensor, next_observations: PyTorchObs, next_actions: th.Tensor

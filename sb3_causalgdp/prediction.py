@@ -10,7 +10,7 @@ from stable_baselines3.common.type_aliases import PyTorchObs
 
 from sb3_causalgdp.acceleration.acting import NumpyActing, OnePassActing
 from sb3_causalgdp.checks import first_not_finite_index, fits_float32
-from sb3_causalgdp.networks import q_values
+from sb3_causalgdp.networks import smallest_q
 
 Policy = Any  # a CausalGDPPolicy, whose file imports this one
 
@@ -125,7 +125,7 @@ def _best_candidate(policy: Policy, critic_features: th.Tensor, actions: th.Tens
     if n_candidates == 1:
         return first
     repeated = critic_features.repeat_interleave(n_candidates, dim=0)
-    values = th.cat(q_values(policy.critic_target, repeated, actions), dim=1).amin(dim=1)
+    values = smallest_q(policy.critic_target, repeated, actions)
     return first + values.view(-1, n_candidates).argmax(dim=1)
 
 

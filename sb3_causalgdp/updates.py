@@ -28,7 +28,7 @@ from sb3_causalgdp.losses import (
     trust_region_loss,
     world_model_loss,
 )
-from sb3_causalgdp.networks import q_values
+from sb3_causalgdp.networks import q_values, smallest_q
 from sb3_causalgdp.offline.replay import rows_of
 
 Model = Any  # a CausalGDP, whose file imports this one
@@ -384,8 +384,7 @@ class Updates:
             (gradient,) = th.autograd.grad(values.sum(), actions)
         with th.no_grad():
             improved = improved_actions(next_actions, gradient, self.model.improvement_step)
-            both = [th.cat(q_values(self.critic, features, one), dim=1) for one in (next_actions, improved)]
-            weights = improvement_weights(*(values.amin(dim=1, keepdim=True) for values in both))
+            weights = improvement_weights(*(smallest_q(self.critic, features, one) for one in (next_actions, improved)))
         guidance = self.policy.acting_guidance(self.policy.causal_state(observations), improved) if guided else None
         return Learned(observations, improved, weights, guidance)
 

@@ -76,6 +76,13 @@ def test_running_averages_move_when_critics_are_trained_and_at_no_other_time():
     assert not moved_by(lambda: model.predict(np.zeros((4, 3), dtype=np.float32)))
 
 
+def test_an_error_within_an_update_leaves_no_critic_on_batch_statistics():
+    model = make_model()
+    with pytest.raises(KeyboardInterrupt), model.critic.batch_statistics():
+        raise KeyboardInterrupt
+    assert not any(norm.training for norm in batch_norms(model.critic))
+
+
 def test_critics_that_normalise_batches_are_their_own_targets():
     model = make_model(target_policy_noise=0.0).learn(60)
     assert model.critic_target is model.critic

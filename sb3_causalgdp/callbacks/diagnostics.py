@@ -9,7 +9,7 @@ from stable_baselines3.common.type_aliases import PyTorchObs
 
 from sb3_causalgdp.diffusion.guidance import guidance_shift
 from sb3_causalgdp.diffusion.samplers import bind
-from sb3_causalgdp.networks import q_values
+from sb3_causalgdp.networks import smallest_q
 from sb3_causalgdp.policies import CausalGDPPolicy
 from sb3_causalgdp.prediction import act_in_torch, candidate_noise
 
@@ -69,11 +69,11 @@ def choice(policy: CausalGDPPolicy, observations: PyTorchObs) -> Choice:
     candidates = policy.actor.sample(features.repeat_interleave(n_candidates, dim=0), noise)
     critic_features = critic.extract_features(observations, critic.features_extractor)
     repeated = critic_features.repeat_interleave(n_candidates, dim=0)
-    values = th.cat(q_values(critic, repeated, candidates), dim=1).amin(dim=1).view(-1, n_candidates)
+    values = smallest_q(critic, repeated, candidates).view(-1, n_candidates)
     unguided = values.amax(dim=1).mean()
     spread = candidates.view(n_observations, n_candidates, -1).std(dim=1, correction=0).mean()
     actions = act_in_torch(policy, observations, features, noise)
-    value = th.cat(q_values(critic, critic_features, actions), dim=1).amin(dim=1).mean()
+    value = smallest_q(critic, critic_features, actions).mean()
     advantage = float(value - unguided) if policy.is_guided else 0.0
     return Choice(float(value), advantage, float(spread))
 
