@@ -9,8 +9,8 @@ from stable_baselines3.common.type_aliases import PyTorchObs
 
 class StandardizedExtractor(BaseFeaturesExtractor):
     """
-    The features of another extractor minus their means, in standard deviations, within [-10, 10]. Until
-    :meth:`set_statistics` is called they are as they are. A feature whose ``inverse_std`` is 0 is hidden: it is 0.
+    The features of another extractor minus their means, in standard deviations, within [-10, 10]; as they are until the policy
+    writes the buffers. A feature whose ``inverse_std`` is 0 is hidden: it is 0.
 
     :param extractor: Gives the observation flattened
     :param standardizes: False only hides features, and leaves the others as they are
@@ -37,14 +37,6 @@ class StandardizedExtractor(BaseFeaturesExtractor):
         :return: Whether its features are these variables
         """
         return type(extractor) in (FlattenExtractor, CombinedExtractor) and extractor.features_dim == state_dim
-
-    def set_statistics(self, mean: th.Tensor, inverse_std: th.Tensor) -> None:
-        """
-        :param mean: Of the features, shape ``(features_dim,)``
-        :param inverse_std: One over their standard deviations, shape ``(features_dim,)``
-        """
-        self.mean.copy_(mean)
-        self.inverse_std.copy_(inverse_std)
 
     def forward(self, observations: PyTorchObs) -> th.Tensor:
         standardized = (self.extractor(observations) - self.mean) * self.inverse_std

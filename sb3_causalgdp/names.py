@@ -94,11 +94,15 @@ def _told_by(venv: VecEnv) -> tuple[Names | None, Names | None]:
         _checked(_as_names(venv.get_attr(attribute)[0]), space) if venv.has_attr(attribute) else None
         for attribute, space in (("state_names", venv.observation_space), ("action_names", venv.action_space))
     ]
+    states, actions = told[0] or _checked(key_names(venv.observation_space), venv.observation_space), told[1]
     spec = next(iter(venv.get_attr("spec")), None) if venv.has_attr("spec") else None
     is_gymnasiums = spec is not None and str(spec.entry_point).startswith("gymnasium.")
-    own = _of_one(gym.make(spec.id)) if spec is not None and is_gymnasiums else (None, None)
-    keys = _checked(key_names(venv.observation_space), venv.observation_space)
-    return told[0] or keys or _checked(own[0], venv.observation_space), told[1] or _checked(own[1], venv.action_space)
+    if spec is None or not is_gymnasiums or (states and actions):
+        return states, actions
+    like_them = gym.make(spec.id)
+    own = _of_one(like_them)
+    like_them.close()
+    return states or _checked(own[0], venv.observation_space), actions or _checked(own[1], venv.action_space)
 
 
 def _of_one(env: gym.Env | None) -> tuple[Names | None, Names | None]:

@@ -334,7 +334,8 @@ class CausalGDPPolicy(SavedPolicy):
     def _statistics_of_extractors(self) -> list[th.Tensor]:
         """Mean and factor of each network."""
         networks = (self.actor, self.actor_target, self.critic, self.critic_target)
-        extractors = (network.features_extractor for network in networks)
+        # Networks may share one, and critics that normalise batches are their own targets
+        extractors = dict.fromkeys(network.features_extractor for network in networks)
         return [
             tensor for one in extractors if isinstance(one, StandardizedExtractor) for tensor in (one.mean, one.inverse_std)
         ]

@@ -77,7 +77,23 @@ class HostCopy:
         self._memory.copy_(th.cat([tensor.reshape(-1) for tensor in self._there]))
 
 
-class NumpyActing:
+class _Views:
+    """Views of a policy's memory, or of a copy: of one process, one policy, and the networks that it has now."""
+
+    def _remember(self, modules: tuple[nn.Module, ...], tensors: list[th.Tensor]) -> None:
+        self._modules, self._tensors = modules, tensors
+        self._addresses = list(map(th.Tensor.data_ptr, tensors))
+
+    def _has_the_same(self, modules: tuple[nn.Module, ...]) -> bool:
+        same = all(ours is theirs for ours, theirs in zip(self._modules, modules, strict=True))
+        return same and list(map(th.Tensor.data_ptr, self._tensors)) == self._addresses
+
+    def __reduce__(self) -> tuple[type, tuple]:
+        # Copies and pickles of the policy make their own
+        return type(None), ()
+
+
+class NumpyActing(_Views):
     """
     What :func:`sb3_causalgdp.prediction.act` computes, for few rows.
 
@@ -102,21 +118,14 @@ class NumpyActing:
         points = sampling_points(policy.actor.schedule, policy.actor.sampling_steps)
         self.rule = None if rule is None else Rule(rule, points, policy.actor.action_dim)
         self._blas = ThreadpoolController().select(user_api="blas")
-        self._modules = _networks_of(policy)
-        self._tensors = HostCopy.tensors_of(policy)
-        self._addresses = list(map(th.Tensor.data_ptr, self._tensors))
-
-    def __reduce__(self) -> tuple[type, tuple]:
-        # Views are of one process and one policy: copies and pickles of the policy make their own
-        return type(None), ()
+        self._remember(_networks_of(policy), HostCopy.tensors_of(policy))
 
     def is_current(self, policy: Policy) -> bool:
         """
         :param policy: The policy
         :return: Whether the views are still those of its networks, which may have been moved or replaced
         """
-        same = all(ours is theirs for ours, theirs in zip(self._modules, _networks_of(policy), strict=True))
-        return same and list(map(th.Tensor.data_ptr, self._tensors)) == self._addresses
+        return self._has_the_same(_networks_of(policy))
 
     @staticmethod
     def covers(policy: Policy) -> bool:
@@ -207,7 +216,7 @@ class NumpyActing:
         return self.features.backward(gradient, features).T
 
 
-class OnePassActing:
+class OnePassActing(_Views):
     """
     What a policy with a one-pass network does, for few rows.
 
@@ -218,19 +227,15 @@ class OnePassActing:
         self.features = Features(policy)
         self.layers = [(view(layer.weight), view(layer.bias)[:, None]) for layer in _linear(policy)]
         self.activation = ACTIVATIONS[policy.activation_fn].value
-        self._network = policy.actor.one_pass
-        self._tensors = [*self._network.parameters(), *policy.critic_target.features_extractor.buffers()]
-        self._addresses = list(map(th.Tensor.data_ptr, self._tensors))
-
-    def __reduce__(self) -> tuple[type, tuple]:
-        return type(None), ()
+        network = policy.actor.one_pass
+        self._remember((network,), [*network.parameters(), *policy.critic_target.features_extractor.buffers()])
 
     def is_current(self, policy: Policy) -> bool:
         """
         :param policy: The policy
         :return: Whether the views are still those of its networks, which may have been moved or replaced
         """
-        return policy.actor.one_pass is self._network and list(map(th.Tensor.data_ptr, self._tensors)) == self._addresses
+        return self._has_the_same((policy.actor.one_pass,))
 
     @staticmethod
     def covers(policy: Policy) -> bool:
