@@ -201,7 +201,9 @@ def test_fast_layers_have_the_parameters_of_the_plain_ones_and_draw_no_random_nu
 
 def changes_of_an_update(library):
     use_library(library)
-    model = CausalGDP("MlpPolicy", "Pendulum-v1", learning_starts=250, causal_refresh_freq=205, batch_size=64, seed=0)
+    arguments = {"learning_starts": 250, "causal_refresh_freq": 205, "batch_size": 64, "seed": 0}
+    # Batch statistics and Adam's first step make more of a rounding
+    model = CausalGDP("MlpPolicy", "Pendulum-v1", **arguments, policy_kwargs={"critic_normalization": "layer"})
     model.learn(250)
     assert model.policy.is_guided
     before = th.nn.utils.parameters_to_vector(model.policy.parameters()).detach().clone()
@@ -212,8 +214,7 @@ def changes_of_an_update(library):
 @has_onednn
 def test_an_update_with_guidance_is_the_same_on_both_libraries():
     theirs, ours = (changes_of_an_update(library) for library in ("default", "onednn"))
-    # Batch statistics and Adam's first step make more of a rounding
-    assert (ours - theirs).norm() < 5e-3 * theirs.norm()
+    assert (ours - theirs).norm() < 1e-3 * theirs.norm()
 
 
 class Trainer:

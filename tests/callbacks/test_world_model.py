@@ -361,14 +361,16 @@ def test_a_progress_bar(capsys, monkeypatch):
     model.learn(64, callback=RecordingCallback(), progress_bar=True)
     assert model.causal_graph().num_timesteps == 60
     assert "no episode yet" in capsys.readouterr().out
-    return_only, everything = (progress_of(model, columns, monkeypatch, capsys) for columns in (80, 140))
+    return_only, everything = (progress_of(model, columns, monkeypatch, capsys) for columns in (80, 200))
     edges = f"{model.causal_graph().n_edges} edges"
-    assert "return -155" in return_only and edges not in return_only
-    assert f"return -155, success 50%, {edges}, graph 12 steps old" in everything
+    assert "64/64" in return_only and "return -155" in return_only and edges not in return_only
+    assert "64/64" in everything and f"return -155, success 50%, {edges}, graph 12 steps old" in everything
 
 
 def progress_of(model, columns, monkeypatch, capsys):
     monkeypatch.setenv("COLUMNS", str(columns))
+    # Rich's one console may have been made by another test, for its width
+    monkeypatch.setattr("rich._console", None)
     model.ep_info_buffer.extend([{"r": -150.0}, {"r": -160.0}])
     model.ep_success_buffer.extend([True, False])
     model.learn(64, callback=RecordingCallback(), progress_bar=True, reset_num_timesteps=False)
