@@ -183,11 +183,13 @@ def runs_of(arguments: argparse.Namespace) -> Iterator[Run]:
             )
 
 
-def runs_of_queue(path: Path) -> Iterator[Run]:
-    for line in path.read_text(encoding="utf-8").splitlines():
+def runs_of_queue(arguments: argparse.Namespace) -> Iterator[Run]:
+    parser = make_parser()
+    parser.set_defaults(folder=arguments.folder, checkpoints=arguments.checkpoints)
+    for line in arguments.queue.read_text(encoding="utf-8").splitlines():
         words = shlex.split(line, comments=True)
         if words:
-            yield from runs_of(make_parser().parse_args(words))
+            yield from runs_of(parser.parse_args(words))
 
 
 def launch(run: Run) -> bool:
@@ -208,11 +210,11 @@ def launch(run: Run) -> bool:
     return True
 
 
-def work_on(queue: Path) -> None:
+def work_on(arguments: argparse.Namespace) -> None:
     """Until all runs of the queue are complete or failed."""
     failed: set[str] = set()
     while True:
-        for run in runs_of_queue(queue):
+        for run in runs_of_queue(arguments):
             if run.title in failed:
                 continue
             try:
@@ -230,7 +232,7 @@ def main() -> None:
     if arguments.one:
         train(next(runs_of(arguments)))
     elif arguments.queue:
-        work_on(arguments.queue)
+        work_on(arguments)
     else:
         with ThreadPoolExecutor(arguments.workers) as pool:
             for future in [pool.submit(launch, run) for run in runs_of(arguments)]:
