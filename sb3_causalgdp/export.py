@@ -175,7 +175,7 @@ class ExportedPolicy(nn.Module):
         sizes = {size for name in self.input_names for size in self._shape(name)}
         # PyTorch takes dimensions of one size for one dimension
         n_rows = next(size for size in itertools.count(N_CHECKED) if size not in sizes)
-        parts = {key: _examples_of(space, n_rows) for key, space in self.spaces.items()}
+        parts = self._observations(n_rows)
         observation: Any = parts if self.is_dict else parts["observation"]
         if self.normalizer is not None:
             observation = self.normalizer.normalize_obs(observation)
@@ -185,6 +185,20 @@ class ExportedPolicy(nn.Module):
             th.manual_seed(0)
             noise = self._drawn_noise(n_rows)
         return [*parts.values(), *noise], actions
+
+    def _observations(self, n_rows: int) -> dict[str, np.ndarray]:
+        """About as the policy has seen them: far from there the guidance of a young world model makes much of rounding."""
+        world_model = self.policy.world_model
+        starts = np.cumsum([0, *(spaces.flatdim(space) for space in self.spaces.values())])
+        # Otherwise the states are features of images
+        is_state = self.normalizer is None and starts[-1] == len(world_model.state_mean)
+        parts = {}
+        for key, (start, end) in zip(self.spaces, itertools.pairwise(starts), strict=True):
+            mean, std = self._statistics(key)
+            if is_state:
+                mean, std = world_model.state_mean[start:end], world_model.state_std[start:end]
+            parts[key] = _examples_of(self.spaces[key], n_rows, 0.0 if mean is None else mean, 1.0 if std is None else std)
+        return parts
 
     def _drawn_noise(self, n_rows: int) -> Arrays:
         """As ``predict`` draws it."""
@@ -244,14 +258,16 @@ def _space_below(normalizer: VecNormalize, policy: Policy) -> spaces.Space:
     return normalizer.venv.observation_space
 
 
-def _examples_of(space: spaces.Space, n_rows: int) -> np.ndarray:
-    """Different rows of a space, the same at every call."""
+def _examples_of(space: spaces.Space, n_rows: int, mean: th.Tensor | float, std: th.Tensor | float) -> np.ndarray:
+    """Different rows of a space, the same at every call; of floating-point numbers around a mean."""
     space = copy.deepcopy(space)
     space.seed(0)
     rows = np.stack([space.sample() for _ in range(n_rows)])
     if isinstance(space, spaces.Box) and np.issubdtype(rows.dtype, np.floating):
         # Not from bounds that may be as far away as numbers go
-        rows = np.clip(np.random.default_rng(0).normal(size=rows.shape), space.low, space.high).astype(rows.dtype)
+        middle, spread = (np.broadcast_to(np.ravel(value), rows[0].size).reshape(space.shape) for value in (mean, std))
+        rows = middle + spread * np.random.default_rng(0).normal(size=rows.shape)
+        rows = np.clip(rows, space.low, space.high).astype(space.dtype)
     return rows
 
 

@@ -17,7 +17,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNorm
 from torch import nn
 
 from sb3_causalgdp import CausalGDP, CausalWorldModelCallback
-from sb3_causalgdp.export import _solve_by_elimination
+from sb3_causalgdp.export import ExportedPolicy, _solve_by_elimination
 
 TOLERANCE = 1e-5
 HAS_ONNX = all(importlib.util.find_spec(name) is not None for name in ("onnx", "onnxscript", "onnxruntime"))
@@ -172,6 +172,18 @@ def test_far_from_zero_normalisation_keeps_double_precision(tmp_path):
     expected, _ = model.predict(env.normalize_obs(raw), deterministic=True)
     np.testing.assert_allclose(run(tmp_path / "policy.pt", raw), expected, atol=TOLERANCE)
     assert metadata_of(tmp_path / "policy.pt")["inputs"][0]["dtype"] == "float64"
+
+
+@pytest.mark.parametrize("is_normalized", [False, True])
+def test_a_file_is_compared_where_the_policy_was_trained(is_normalized, tmp_path):
+    space = spaces.Dict(small=spaces.Box(-1e9, 1e9, (2,)), large=spaces.Box(-1e9, 1e9, (1,)))
+    env = DummyVecEnv([lambda: Sums(spaces.Dict(small=spaces.Box(3.0, 3.1, (2,)), large=spaces.Box(1e4, 2e4, (1,))))])
+    env.observation_space = space
+    env = VecNormalize(env) if is_normalized else env
+    model = trained(env, "MultiInputPolicy")
+    inputs, _ = ExportedPolicy(model.policy, True, True, model.get_vec_normalize_env()).examples()
+    examples = dict(zip(space, inputs, strict=True))
+    assert np.abs(examples["small"] - 3.05).max() < 0.2 and np.abs(examples["large"] - 1.5e4).max() < 2e4
 
 
 @pytest.mark.parametrize(
