@@ -35,8 +35,8 @@ from sb3_causalgdp.checkpoints.checkpoint import all_callbacks, end_last_episode
 from sb3_causalgdp.checks import check_from_environment, is_finite
 from sb3_causalgdp.distillation import distil
 from sb3_causalgdp.divergence import TrainingDivergedError, check_losses
-from sb3_causalgdp.offline.algorithm import callback_list
 from sb3_causalgdp.offline.preload import normalised_parts
+from sb3_causalgdp.offline.pretraining import callback_list
 from sb3_causalgdp.policies import CausalGDPPolicy, CnnPolicy, DiffusionActor, MlpPolicy, MultiInputPolicy
 from sb3_causalgdp.questions import AskedAlgorithm
 from sb3_causalgdp.saving.algorithm import SavedAlgorithm

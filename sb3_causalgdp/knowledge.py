@@ -25,6 +25,7 @@ from sb3_causalgdp.causal.endings import with_endings
 from sb3_causalgdp.causal.world_model import MaskedWorldModel
 from sb3_causalgdp.names import found_names
 from sb3_causalgdp.offline.algorithm import OfflineToOnlineAlgorithm
+from sb3_causalgdp.offline.rewards import RewardTransform
 from sb3_causalgdp.policies import CausalGDPPolicy, DiffusionActor
 from sb3_causalgdp.updates import Updates
 
@@ -188,10 +189,13 @@ class DiscoveringAlgorithm(OfflineToOnlineAlgorithm):
         made_by = [name, self.causal_discovery_kwargs, *forgetting]  # a list, as it comes back from the zip
         if self.causal_statistics is None or self._statistics_made_by != made_by:
             # Another method, which load() may have brought, gathers anew from the replay buffer
-            self.causal_statistics = self._new_statistics()
+            self._forget_statistics()
             self._statistics_made_by = made_by
-            self._fed_position = self._fed_offline_position = 0
-            self._fed_marks = []
+
+    def _forget_statistics(self) -> None:
+        self.causal_statistics = self._new_statistics()
+        self._fed_position = self._fed_offline_position = 0
+        self._fed_marks = []
 
     def _named_variables(self) -> TransitionVariables:
         """By the names that were given, the environment's own, or indices."""
@@ -231,6 +235,10 @@ class DiscoveringAlgorithm(OfflineToOnlineAlgorithm):
             # A loaded model, whose statistics know these rows
             self._fed_offline_position = self.offline_buffer.size()
         return self
+
+    def _transform_collected(self, transform: RewardTransform) -> None:
+        super()._transform_collected(transform)
+        self._forget_statistics()
 
     def load_replay_buffer(
         self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True, *, trusted: bool = False

@@ -1,13 +1,13 @@
 """Networks of CausalGDP, what they are fed and how they are guided, as one SB3 policy."""
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.preprocessing import is_image_space, preprocess_obs
+from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.torch_layers import (
     BaseFeaturesExtractor,
     CombinedExtractor,
@@ -19,32 +19,27 @@ from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from stable_baselines3.common.vec_env import VecNormalize
 from torch import nn
 
-from sb3_causalgdp.abstraction import forget_inputs, forget_outputs
+from sb3_causalgdp.abstraction import AbstractingPolicy
 from sb3_causalgdp.acceleration.acting import NumpyActing, OnePassActing
 from sb3_causalgdp.acceleration.activations import fast
 from sb3_causalgdp.arguments import POLICY_ARGUMENTS, check_arguments, check_keywords
 from sb3_causalgdp.causal import (
-    CausalGuidance,
-    LinearisedGuidance,
     MaskedWorldModel,
-    ReturnTarget,
-    RewardTarget,
     TransitionVariables,
 )
-from sb3_causalgdp.causal.guidance import OutcomeTarget
 from sb3_causalgdp.checks import is_finite
-from sb3_causalgdp.diffusion import GuidanceRule, MLPDenoiser
+from sb3_causalgdp.diffusion import GuidanceRule
 from sb3_causalgdp.divergence import TrainingDivergedError
 from sb3_causalgdp.export import export_policy
 from sb3_causalgdp.extractors import StandardizedExtractor
-from sb3_causalgdp.networks import Critic, DiffusionActor, activation_class, q_values
+from sb3_causalgdp.networks import Critic, DiffusionActor, activation_class
 from sb3_causalgdp.prediction import act, check_observation, fixed_noise
 from sb3_causalgdp.saving.models import KNOWN
 from sb3_causalgdp.saving.plain import Known
-from sb3_causalgdp.saving.policies import SavedPolicy
+from sb3_causalgdp.steering import leaf_spaces
 
 
-class CausalGDPPolicy(SavedPolicy):
+class CausalGDPPolicy(AbstractingPolicy):
     """
     Policy of CausalGDP: diffusion actor, its moving average, critics, their targets and the masked world model.
 
@@ -97,17 +92,7 @@ class CausalGDPPolicy(SavedPolicy):
         :meth:`show`
     """
 
-    actor: DiffusionActor
-    actor_target: DiffusionActor
-    critic: Critic
-    critic_target: Critic
-    """The critics themselves where they normalise batches."""
-    reward_target: th.Tensor
-    return_std: th.Tensor
-    guidance_ready: th.Tensor
     candidate_noise: th.Tensor
-    state_gate: th.Tensor
-    action_gate: th.Tensor
 
     def __init__(
         self,
@@ -225,9 +210,9 @@ class CausalGDPPolicy(SavedPolicy):
 
     def _build(self, lr_schedule: Schedule) -> None:
         # Here, because a compiler cannot see through flatdim()
-        self.leaf_sizes = [spaces.flatdim(space) for space in _leaf_spaces(self.observation_space)]
+        self.leaf_sizes = [spaces.flatdim(space) for space in leaf_spaces(self.observation_space)]
         self.has_image_state = any(
-            is_image_space(space, normalized_image=not self.normalize_images) for space in _leaf_spaces(self.observation_space)
+            is_image_space(space, normalized_image=not self.normalize_images) for space in leaf_spaces(self.observation_space)
         )
         self._acting: NumpyActing | OnePassActing | None = None
         self.register_buffer("reward_target", th.zeros(()))
@@ -254,6 +239,12 @@ class CausalGDPPolicy(SavedPolicy):
         noise = fixed_noise(self.actor.n_noises, self.n_action_candidates, self.actor.action_dim)
         self.register_buffer("candidate_noise", noise, persistent=False)
 
+        self._make_optimizers(lr_schedule)
+        self.actor_target.set_training_mode(False)
+        if self.critic_target is not self.critic:
+            self.critic_target.set_training_mode(False)
+
+    def _make_optimizers(self, lr_schedule: Schedule) -> None:
         optimizer_kwargs = self.optimizer_kwargs
         if issubclass(self.optimizer_class, (th.optim.Adam, th.optim.AdamW)) and self.critic.normalizes_batches:
             # What batch statistics give is outdated soon (CrossQ)
@@ -270,38 +261,6 @@ class CausalGDPPolicy(SavedPolicy):
                 )
             except (TypeError, ValueError) as error:
                 raise ValueError(f"optimizer_kwargs={self.optimizer_kwargs!r} do not fit: {error}") from error
-        self.actor_target.set_training_mode(False)
-        if self.critic_target is not self.critic:
-            self.critic_target.set_training_mode(False)
-
-    def _check_guidance_steps(self) -> None:
-        n_steps = self.actor.schedule.n_steps
-        if self.guidance_rule is not None and len(self.guidance_rule.scales) not in (1, n_steps):
-            raise ValueError(
-                f"guidance_scale must be one number or one for each of the {n_steps} diffusion steps, "
-                f"got {len(self.guidance_rule.scales)} values"
-            )
-
-    def _check_attention(self) -> None:
-        if not getattr(self.actor.denoiser, "causal", False):
-            return
-        extractor = self.actor.features_extractor
-        plain = type(extractor) in (FlattenExtractor, CombinedExtractor, StandardizedExtractor)
-        if self.has_image_state or not plain:
-            raise ValueError(
-                "denoiser_kwargs={'causal': True} needs observations that are vectors and no features extractor, got "
-                f"{type(extractor).__name__} for {self.observation_space}"
-            )
-
-    def set_attention(self, masks: Sequence[th.Tensor]) -> None:
-        """
-        Let a denoiser look along a causal graph, where it was made to.
-
-        :param masks: As :meth:`~sb3_causalgdp.causal.MaskedWorldModel.set_masks` takes them
-        """
-        for actor in (self.actor, self.actor_target):
-            if getattr(actor.denoiser, "causal", False):
-                actor.denoiser.set_graph(*masks)  # type: ignore[operator]
 
     def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> DiffusionActor:
         return DiffusionActor(**self._update_features_extractor(self.actor_kwargs, features_extractor)).to(self.device)
@@ -320,121 +279,6 @@ class CausalGDPPolicy(SavedPolicy):
         if is_covered and (self.normalize_observations or self.causal_abstraction):
             return StandardizedExtractor(extractor, self.normalize_observations).to(self.device)
         return extractor
-
-    @th.no_grad()
-    def update_observation_statistics(self) -> None:
-        """Let actor, critics and their targets see observations by what the world model knows of them by now."""
-        own = self._statistics_of_extractors()
-        if own and self.normalize_observations:
-            inverse_std = 1.0 / self.world_model.state_std
-            if self.causal_abstraction:
-                inverse_std *= self.state_gate
-            th._foreach_copy_(own, [self.world_model.state_mean, inverse_std] * (len(own) // 2))
-
-    def _statistics_of_extractors(self) -> list[th.Tensor]:
-        """Mean and factor of each network."""
-        networks = (self.actor, self.actor_target, self.critic, self.critic_target)
-        # Networks may share one, and critics that normalise batches are their own targets
-        extractors = dict.fromkeys(network.features_extractor for network in networks)
-        return [
-            tensor for one in extractors if isinstance(one, StandardizedExtractor) for tensor in (one.mean, one.inverse_std)
-        ]
-
-    # Causal abstraction -------------------------------------------------------------------------------------------------
-
-    @th.no_grad()
-    def show(self, states: th.Tensor, actions: th.Tensor) -> None:
-        """
-        Say what actor, critics and their targets see. Hidden components of observations are constant for them. Hidden ones of
-        actions are 0 in all that the actor gives and the critics are asked, before the exploration noise. What is shown again
-        starts with weights of 0, so that no output jumps. The world model sees everything always.
-
-        :param states: Which state variables are shown, boolean, shape ``(n,)``
-        :param actions: Which components of the actions are shown, boolean, shape ``(d,)``
-        :raises ValueError: If the policy was made without ``causal_abstraction``
-        """
-        if not self.causal_abstraction:
-            raise ValueError("causal_abstraction must be True for a policy that hides components of observations, got False")
-        states, actions = states.to(self.device, th.bool), actions.to(self.device, th.bool)
-        before, actions_before = self.state_gate > 0.0, self.action_gate > 0.0
-        if th.equal(states, before) and th.equal(actions, actions_before):
-            return
-        self._begin_anew(states & ~before, actions & ~actions_before, before, actions_before)
-        self._stop_modelling(~actions & actions_before)
-        self.state_gate.copy_(states)
-        self.action_gate.copy_(actions)
-        self._write_action_gates()
-        if self.normalize_observations:
-            self.update_observation_statistics()
-        else:
-            for factor in self._statistics_of_extractors()[1::2]:
-                factor.copy_(self.state_gate)
-
-    def _write_action_gates(self) -> None:
-        for network in (self.actor, self.actor_target, self.critic, self.critic_target):
-            assert network.action_gate is not None
-            network.action_gate.copy_(self.action_gate)
-
-    def _trained_networks(self) -> list[tuple[DiffusionActor | Critic, th.optim.Optimizer | None]]:
-        """Actor and critics, each with its optimizer, and their targets, which have none."""
-        networks = {network: network.optimizer for network in (self.actor, self.critic)}
-        return list({self.actor_target: None, self.critic_target: None, **networks}.items())  # type: ignore[arg-type]
-
-    def _begin_anew(self, states: th.Tensor, actions: th.Tensor, known: th.Tensor, known_actions: th.Tensor) -> None:
-        """Of inputs that are shown again, forget what was learned of them."""
-        mean, variance = th.zeros_like(self.world_model.state_mean), th.ones_like(self.world_model.state_mean)
-        if not self.normalize_observations:
-            mean, variance = self.world_model.state_mean, self.world_model.state_std.square()
-        # Actions are in [-1, 1]
-        unit = th.cat([mean, 0.0 * actions]), th.cat([variance, th.full_like(actions, 1.0 / 3.0, dtype=variance.dtype)])
-        inputs, known_inputs = th.cat([states, actions]), th.cat([known, known_actions])
-        for network, optimizer in self._trained_networks():
-            if isinstance(network, Critic):
-                for q_network in network.q_networks:
-                    forget_inputs(q_network.children(), inputs, known_inputs, unit, optimizer)
-            else:
-                layer, _ = _layers_of(network.denoiser)
-                times = th.zeros(layer.in_features - len(inputs), dtype=th.bool, device=self.device)
-                # Of noisy actions the weights are 0 since they were hidden
-                columns = th.cat([th.zeros_like(actions), times, states])
-                forget_inputs([layer], columns, th.cat([known_actions, ~times, known]), unit, optimizer)
-
-    def _stop_modelling(self, actions: th.Tensor) -> None:
-        """Let the denoisers neither see nor give components of actions."""
-        for network, optimizer in self._trained_networks():
-            if isinstance(network, DiffusionActor):
-                layer, last = _layers_of(network.denoiser)
-                others = th.zeros(layer.in_features - len(actions), dtype=th.bool, device=self.device)
-                columns = th.cat([actions, others])
-                forget_inputs([layer], columns, ~columns, (columns, columns), optimizer)
-                forget_outputs(last, actions, optimizer)
-
-    def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False) -> Any:
-        """
-        As PyTorch's. What was hidden in a policy is shown again in one without ``causal_abstraction``, and one that has it
-        hides nothing yet after the parameters of one without.
-
-        :param state_dict: Tensors by name
-        :param strict: As PyTorch's
-        :param assign: As PyTorch's
-        :return: As PyTorch's
-        """
-        state_dict = dict(state_dict)
-        if self.causal_abstraction:
-            if strict:
-                open_gates = {"state_gate": th.ones_like(self.state_gate), "action_gate": th.ones_like(self.action_gate)}
-                state_dict = {**open_gates, **state_dict}
-            result = super().load_state_dict(state_dict, strict, assign)
-            self._write_action_gates()
-            return result
-        of_states, of_actions = state_dict.pop("state_gate", None), state_dict.pop("action_gate", None)
-        result = super().load_state_dict(state_dict, strict, assign)
-        if of_states is not None and of_actions is not None:
-            shown, modelled = of_states.to(self.device) > 0.0, of_actions.to(self.device) > 0.0
-            with th.no_grad():
-                self._begin_anew(~shown, ~modelled, shown, modelled)
-                self.update_observation_statistics()
-        return result
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         data = super()._get_constructor_parameters()
@@ -476,131 +320,6 @@ class CausalGDPPolicy(SavedPolicy):
         for module in modules:
             module.train(mode)
         self.training = mode
-
-    # The causal model's state -------------------------------------------------------------------------------------------
-
-    def _state_dim(self) -> int:
-        if self.has_image_state:
-            return self.critic_target.features_extractor.features_dim
-        return sum(self.leaf_sizes)
-
-    def state_names(self) -> tuple[str, ...]:
-        """
-        :return: Names of the causal model's state variables, by the observation space's keys and indices
-        """
-        if self.has_image_state:
-            return tuple(f"feature[{index}]" for index in range(self._state_dim()))
-        names = list(self.observation_space.spaces) if isinstance(self.observation_space, spaces.Dict) else ["obs"]
-        # The key "action" would give the names of the actions
-        prefixes = [f"obs[{name}]" if name == "action" else name for name in names]
-        sized = zip(prefixes, self.leaf_sizes, strict=True)
-        return tuple(f"{prefix}[{index}]" for prefix, size in sized for index in range(size))
-
-    @th.no_grad()
-    def causal_state(self, observation: PyTorchObs) -> th.Tensor:
-        """
-        The variables of the causal model: the observation flattened (discrete parts one-hot), or, where there are images, the
-        features of the target critic, through which no gradient flows.
-
-        :param observation: Observations as SB3 gives them to policies
-        :return: Shape ``(batch, n)``
-        """
-        if self.has_image_state:
-            return self.critic_target.extract_features(observation, self.critic_target.features_extractor)
-        preprocessed = preprocess_obs(observation, self.observation_space, normalize_images=self.normalize_images)
-        if isinstance(self.observation_space, spaces.Dict):
-            assert isinstance(preprocessed, dict)
-            return th.cat([preprocessed[key].flatten(1) for key in self.observation_space.spaces], dim=1)
-        assert isinstance(preprocessed, th.Tensor)
-        return preprocessed.flatten(1)
-
-    @th.no_grad()
-    def exact_causal_state(self, observation: PyTorchObs) -> th.Tensor:
-        """
-        :meth:`causal_state` in double precision, for statistics and answers in the environment's units: far from 0, float32
-        loses a small motion.
-
-        :param observation: Observations as the environment gives them
-        :return: float64, shape ``(batch, n)``
-        """
-        if self.has_image_state:
-            return self.causal_state(observation).double()
-        if isinstance(observation, dict):
-            named = self.observation_space.spaces.items()  # type: ignore[attr-defined]
-            return th.cat([_exactly(observation[key], space) for key, space in named], dim=1)
-        return _exactly(observation, self.observation_space)
-
-    def _features_of_state(self, state: th.Tensor, extractor: nn.Module) -> th.Tensor:
-        """Features of predicted states, which have no observation: the inverse of :meth:`causal_state`."""
-        if not isinstance(self.observation_space, spaces.Dict):
-            return extractor(_as_observation(state, self.observation_space))
-        named = self.observation_space.spaces.items()
-        parts = state.split(self.leaf_sizes, dim=1)
-        return extractor({key: _as_observation(part, space) for (key, space), part in zip(named, parts, strict=True)})
-
-    def value_gradient(self, state: th.Tensor, action: th.Tensor, critic: int | None = None) -> th.Tensor:
-        """
-        Gradient of the target Q at a predicted state by the state.
-
-        :param state: Shape ``(batch, n)``
-        :param action: The action that follows, held fixed, shape ``(batch, d)``
-        :param critic: The critic whose Q it is; None takes the smallest Q of all
-        :return: Shape ``(batch, n)``, without a graph
-        """
-        networks = slice(None) if critic is None else slice(critic, critic + 1)
-        with th.enable_grad():
-            state = state.detach().requires_grad_()
-            features = state if self.has_image_state else self._features_of_state(state, self.critic_target.features_extractor)
-            values = q_values(self.critic_target, features, action, networks)
-            smallest = values[0] if len(values) == 1 else th.cat(values, dim=1).amin(dim=1)
-            (gradient,) = th.autograd.grad(smallest.sum(), state)
-        return gradient
-
-    # Guidance -----------------------------------------------------------------------------------------------------------
-
-    @property
-    def is_guided(self) -> bool:
-        """Whether samples are steered: the guidance is on and the causal graph has been found."""
-        return self.guidance_rule is not None and max(self.guidance_rule.scales) > 0.0 and bool(self.guidance_ready)
-
-    def make_guidance(
-        self, state: th.Tensor, next_state: th.Tensor, next_action: th.Tensor, critic: int | None = None
-    ) -> CausalGuidance:
-        """
-        :param state: s, shape ``(batch, n)``
-        :param next_state: s* that is wished for, shape ``(batch, n)``
-        :param next_action: The action that would follow in s*, for the return target, shape ``(batch, d)``
-        :param critic: The critic that the return target climbs; None takes the smallest Q of all
-        :return: The guidance for these states
-        """
-        outcome: OutcomeTarget
-        if self.guidance_target == "return":
-            outcome = ReturnTarget(
-                lambda predicted: self.value_gradient(predicted, next_action, critic), self.discount, self.return_std
-            )
-        else:
-            outcome = RewardTarget(self.reward_target)
-        return CausalGuidance(
-            self.world_model, state, next_state, outcome, self.state_guidance_scale, self.outcome_guidance_scale
-        )
-
-    def acting_guidance(self, state: th.Tensor, action: th.Tensor) -> LinearisedGuidance:
-        """
-        Guidance where the next state is not known: s* is the model's own prediction for an action, about which the guidance is
-        linear, so that the world model is evaluated once and not at every diffusion step.
-
-        :param state: s, shape ``(batch, n)``
-        :param action: The best candidate, shape ``(batch, d)``
-        :return: The guidance for these states
-        """
-        response = self.world_model.action_response(state, action)
-        next_state = response.next_state
-        next_action = action
-        if self.guidance_target == "return" and not self.has_image_state:
-            features = self._features_of_state(next_state, self.actor.features_extractor)
-            # The next state is near: one step of the denoiser stands for a chain
-            next_action = self.actor.adapt(features, action)
-        return LinearisedGuidance(self.make_guidance(state, next_state, next_action), action, response)
 
     # Prediction ---------------------------------------------------------------------------------------------------------
 
@@ -665,29 +384,6 @@ class CausalGDPPolicy(SavedPolicy):
     @classmethod
     def known_classes(cls) -> Known:
         return KNOWN + Known([], [CausalGDPPolicy, CnnPolicy, MultiInputPolicy])
-
-
-def _layers_of(denoiser: nn.Module) -> tuple[nn.Linear, nn.Linear]:
-    """The first and the last layer of a perceptron."""
-    assert isinstance(denoiser, MLPDenoiser)
-    last = [denoiser.input_layer, *denoiser.network][-1]
-    assert isinstance(last, nn.Linear)
-    return denoiser.input_layer, last
-
-
-def _leaf_spaces(space: spaces.Space) -> list[spaces.Space]:
-    return list(space.spaces.values()) if isinstance(space, spaces.Dict) else [space]
-
-
-def _exactly(values: th.Tensor, space: spaces.Space) -> th.Tensor:
-    if not isinstance(space, spaces.Box):
-        values = preprocess_obs(values, space)  # type: ignore[assignment]
-    return values.double().flatten(1)
-
-
-def _as_observation(state: th.Tensor, space: spaces.Space) -> th.Tensor:
-    """A box has its own shape; what is not a box has been preprocessed to a vector."""
-    return state.reshape(-1, *space.shape) if isinstance(space, spaces.Box) else state
 
 
 class CnnPolicy(CausalGDPPolicy):

@@ -16,10 +16,11 @@ LAYERS = [
     {"callbacks.world_model", "updates"},
     {"losses", "batches", "distillation", "callbacks.diagnostics", "questions", "acceleration.fast_steps"},
     {"policies", "acceleration.device_replay", "acceleration.cuda_graphs", "acceleration.gradients"},
-    {"export"},
+    {"export", "abstraction"},
+    {"steering"},
     {"prediction", "acceleration.product_pass"},
     {"networks", "acceleration.acting"},
-    {"saving.policies", "acceleration.numpy_networks", "abstraction"},
+    {"saving.policies", "acceleration.numpy_networks", "forgetting"},
     {"arguments", "names", "saving.models"},
     {"causal.__main__"},
     {"causal", "offline", "diffusion", "stress"},
@@ -64,7 +65,7 @@ WITHOUT_SB3 = {
     "acceleration.fast_steps",
     "acceleration.numpy_networks",
     "acceleration.switch",
-    "abstraction",
+    "forgetting",
 }
 LEVELS = {part: level for level, parts in enumerate(LAYERS) for part in parts}
 FILES = sorted(PACKAGE.rglob("*.py"))

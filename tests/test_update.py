@@ -13,8 +13,8 @@ from sb3_causalgdp import CausalGDP
 from sb3_causalgdp.batches import Batches
 from sb3_causalgdp.diffusion.bounds import bounded
 from sb3_causalgdp.losses import denoising_loss
+from sb3_causalgdp.networks import q_values
 from sb3_causalgdp.offline.replay import deal_rows, rows_of
-from sb3_causalgdp.policies import q_values
 
 KWARGS = {
     "policy_kwargs": {"net_arch": [16, 16], "world_model_net_arch": [8, 8]},

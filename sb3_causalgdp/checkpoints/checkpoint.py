@@ -29,6 +29,7 @@ from sb3_causalgdp.checkpoints.pickles import classes_in, from_bytes, to_bytes
 from sb3_causalgdp.checkpoints.store import Checkpoint, open_checkpoint, run_of, write_checkpoint
 from sb3_causalgdp.checkpoints.transitions import FOLDER, Log, rest_of, set_rest
 from sb3_causalgdp.files import errors_about, replaced_when_done, temporary_folder
+from sb3_causalgdp.offline.rewards import RewardTransform
 from sb3_causalgdp.offline.saved_buffers import BUFFERS, check_columns
 from sb3_causalgdp.saving.archives import errors_of
 from sb3_causalgdp.saving.models import check_limits
@@ -176,8 +177,11 @@ def _log_of(model: OffPolicyAlgorithm, name: str, buffer: Any, folder: Path) -> 
     known = own.logs.get(name) if own.folder == folder.absolute() else None
     preloaded = buffer is getattr(model, "offline_buffer", None)
     stored = buffer.size() if preloaded else max(_stored_rows(model), buffer.size())
-    # Another preload may have changed the rewards of all
-    version = f"{len(getattr(model, '_offline_marks', []))} preloaded" if preloaded else ""
+    # A preload may change the rewards of all
+    transform = getattr(model, "_reward_transform", None)
+    version = "" if transform in (None, RewardTransform()) else str(transform)
+    if preloaded:
+        version = f"{len(getattr(model, '_offline_marks', []))} preloaded"
     return (known or Log()).append(buffer, folder / FOLDER, f"{own.run}-{name}", stored, version)
 
 

@@ -1,6 +1,7 @@
 """Replay buffers in files to which only what is new is added."""
 
 import weakref
+import zlib
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -94,7 +95,9 @@ class Log:
         while segments and segments[-1].first >= oldest and self._are_put_together(segments[-1], first, stored):
             first = segments.pop().first
         if stored > first:
-            name = f"{prefix}-{first:010d}-{stored:010d}.npz"
+            # Rows that change get a file of their own: older checkpoints need the former one
+            of_version = f"-{zlib.crc32(version.encode()):08x}" if version else ""
+            name = f"{prefix}{of_version}-{first:010d}-{stored:010d}.npz"
             with replaced_when_done(folder / name) as file:
                 np.savez(file, allow_pickle=False, **_rows(buffer, _indices(buffer, first, stored, stored)))
             segments.append(Segment(name, first, stored))

@@ -22,7 +22,7 @@ from sb3_causalgdp.divergence import ParametersError, TrainingDivergedError, che
 from sb3_causalgdp.export import export_policy
 from sb3_causalgdp.files import write_bytes
 from sb3_causalgdp.knowledge import DiscoveringAlgorithm
-from sb3_causalgdp.offline.algorithm import callback_list
+from sb3_causalgdp.offline.pretraining import callback_list
 from sb3_causalgdp.policies import CausalGDPPolicy, CnnPolicy, MultiInputPolicy
 from sb3_causalgdp.saving.archives import errors_of, named, one_line
 from sb3_causalgdp.saving.models import KNOWN, LARGE, append_entries, plain_entries, read_parameters, read_values

@@ -15,7 +15,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.save_util import save_to_pkl
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from sb3_causalgdp import CausalGDP
+from sb3_causalgdp import CausalGDP, CausalWorldModelCallback
 from sb3_causalgdp.offline.observations import flatten_batch
 from sb3_causalgdp.offline.sources import MinariSource
 
@@ -295,6 +295,25 @@ def test_reward_transforms(name, dataset, episodes):
     model._last_obs = env.reset()
     model._store_transition(model.replay_buffer, np.zeros((1, 1)), model._last_obs, np.array([2.0]), [False], [{}])
     assert model.replay_buffer.rewards[model.replay_buffer.pos - 1, 0] == pytest.approx(2.0 * scale + shift, rel=1e-5)
+
+
+@pytest.mark.parametrize("name", ["none", "antmaze"])
+def test_what_was_collected_before_gets_the_transform_too(name, tmp_path):
+    model, plain = (make(reward_transform=one, learning_starts=50, tau=0.5) for one in (name, "none"))
+    scale, shift = REWARDS[name]
+    for one in (model, plain):
+        one.learn(30, callback=CausalWorldModelCallback(min_transitions=20))
+    model.save_checkpoint(tmp_path)
+    statistics, rewards = model.causal_statistics, model.replay_buffer.rewards[:30].copy()
+    model.preload(ARRAYS)
+    np.testing.assert_allclose(model.replay_buffer.rewards[:30], scale * rewards + shift, rtol=1e-6)
+    assert not model.replay_buffer.rewards[30:].any()
+    # They are counted anew, in one unit
+    assert (model.causal_statistics is statistics) == (name == "none")
+    # Rows that a checkpoint wrote before are written again
+    model.save_checkpoint(tmp_path)
+    resumed = CausalGDP.resume(tmp_path, "Pendulum-v1")
+    np.testing.assert_array_equal(resumed.replay_buffer.rewards, model.replay_buffer.rewards)
 
 
 def raw_and_saved(folder, name, suffix):
