@@ -11,7 +11,6 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
-from stable_baselines3.common.logger import TensorBoardOutputFormat
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy, ContinuousCritic
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
@@ -25,28 +24,26 @@ from sb3_causalgdp.arguments import (
     check_action_space,
     check_arguments,
     check_keywords,
-    counts_episodes,
 )
-from sb3_causalgdp.callbacks import CausalWorldModelCallback
+from sb3_causalgdp.callbacks.own import with_own
 from sb3_causalgdp.causal import CausalGraph
 from sb3_causalgdp.causal.world_model import MaskedWorldModel
-from sb3_causalgdp.checkpoints import TrainingCheckpointCallback, begin_training
-from sb3_causalgdp.checkpoints.checkpoint import all_callbacks, end_last_episodes, fresh_seed
-from sb3_causalgdp.checks import check_from_environment, is_finite
+from sb3_causalgdp.checked import CheckedAlgorithm
+from sb3_causalgdp.checkpoints import begin_training
+from sb3_causalgdp.checkpoints.checkpoint import fresh_seed
 from sb3_causalgdp.distillation import distil
-from sb3_causalgdp.divergence import TrainingDivergedError, check_losses
+from sb3_causalgdp.divergence import check_losses
 from sb3_causalgdp.offline.preload import normalised_parts
 from sb3_causalgdp.offline.pretraining import callback_list
 from sb3_causalgdp.policies import CausalGDPPolicy, CnnPolicy, DiffusionActor, MlpPolicy, MultiInputPolicy
 from sb3_causalgdp.questions import AskedAlgorithm
-from sb3_causalgdp.saving.algorithm import SavedAlgorithm
 from sb3_causalgdp.saving.policies import with_first_defaults
 from sb3_causalgdp.updates import Losses, StepPlan, Updates, optimizer_of
 
 SelfCausalGDP = TypeVar("SelfCausalGDP", bound="CausalGDP")
 
 
-class CausalGDP(AskedAlgorithm, SavedAlgorithm):
+class CausalGDP(AskedAlgorithm, CheckedAlgorithm):
     """
     Causality-Guided Diffusion Policy (CausalGDP).
 
@@ -181,8 +178,6 @@ class CausalGDP(AskedAlgorithm, SavedAlgorithm):
 
     # What a gradient step does: a subclass may have its own
     updates_class: ClassVar[type[Updates]] = Updates
-
-    PICTURE_BUDGET = 0.01
 
     def __init__(
         self,
@@ -380,24 +375,6 @@ class CausalGDP(AskedAlgorithm, SavedAlgorithm):
         check_action_space(self.action_space)
         self._check_together()
 
-    def _check_together(self) -> None:
-        """Arguments that are right alone, and not with the others."""
-        if self.actor_update == "weighted" and self.expectile is None:
-            raise ValueError("expectile must be a number with actor_update='weighted', got None")
-        n_positions = self.buffer_size // self.n_envs
-        if counts_episodes(self.train_freq) and self.n_envs > 1:
-            raise ValueError(f"train_freq must be in steps with {self.n_envs} environments, got {self.train_freq!r}")
-        if self.replay_buffer_class is None and self.n_steps > 1:
-            if isinstance(self.observation_space, spaces.Dict) or self.optimize_memory_usage:
-                what = "optimize_memory_usage" if self.optimize_memory_usage else "a Dict of observations"
-                raise ValueError(f"n_steps must be 1 with {what}, got {self.n_steps}")
-            if self.n_steps > n_positions:
-                raise ValueError(f"n_steps must be at most {n_positions}, buffer_size / n_envs, got {self.n_steps}")
-        if self.optimize_memory_usage and n_positions < 2:
-            raise ValueError(f"buffer_size must be at least 2 n_envs with optimize_memory_usage, got {self.buffer_size}")
-        buffer_class = self.replay_buffer_class or (ReplayBuffer if self.n_steps == 1 else NStepReplayBuffer)
-        check_keywords("replay_buffer_kwargs", self.replay_buffer_kwargs, buffer_class)
-
     def _own_policy_kwargs(self) -> dict[str, Any]:
         names = (
             "diffusion_steps noise_schedule sampler ddim_eta n_action_candidates guidance guidance_target "
@@ -436,31 +413,10 @@ class CausalGDP(AskedAlgorithm, SavedAlgorithm):
         # Again, for models that were loaded: those that are not trained need no compiler and no GPU
         check_compile(self.compile, self.device)
         self._updates.fast.check_recordable()
-        callbacks = callback_list(callback)
-        n_own = sum(isinstance(one, CausalWorldModelCallback) for top in callbacks for one in all_callbacks(top))
-        if n_own > 1:
-            raise ValueError(f"At most one CausalWorldModelCallback can be passed, got {n_own}")
-        if n_own == 0:
-            # In front of the others, so that evaluations and checkpoints see the new masks
-            callbacks = [CausalWorldModelCallback(), *callbacks]
-        callbacks += self._pictures_for_tensorboard(callbacks)
-        # Behind the others, which have then counted the step that a checkpoint of pretrain() is about
-        callbacks = sorted(callbacks, key=lambda one: isinstance(one, TrainingCheckpointCallback))
+        callbacks = with_own(self, callback_list(callback), self.causal_refresh_freq)
         all_of_them = super()._init_callback(CallbackList(callbacks), progress_bar)
         begin_training(self, all_of_them)
         return all_of_them
-
-    def _pictures_for_tensorboard(self, callbacks: list[BaseCallback]) -> list[BaseCallback]:
-        """Unless the user has own ones: at refreshes, in a hundredth of the training's time."""
-        if not any(isinstance(one, TensorBoardOutputFormat) for one in self.logger.output_formats):
-            return []
-        try:
-            from sb3_causalgdp.callbacks.pictures import CausalPicturesCallback
-        except ImportError:  # without matplotlib
-            return []
-        if any(isinstance(one, CausalPicturesCallback) for top in callbacks for one in all_callbacks(top)):
-            return []
-        return [CausalPicturesCallback(self.causal_refresh_freq, budget=self.PICTURE_BUDGET)]
 
     def train(self, gradient_steps: int, batch_size: int = 256) -> None:
         if self._waits_for_episode():
@@ -566,46 +522,6 @@ class CausalGDP(AskedAlgorithm, SavedAlgorithm):
             student = distil(self.policy, observations, gradient_steps, batch_size, learning_rate)
         np.random.set_state(numpy_state)
         return student
-
-    def _setup_learn(
-        self,
-        total_timesteps: int,
-        callback: MaybeCallback = None,
-        reset_num_timesteps: bool = True,
-        *args,
-        **kwargs,
-    ) -> tuple[int, BaseCallback]:
-        if self.replay_buffer is not None and (reset_num_timesteps or self._last_obs is None):
-            # SB3 resets the environments
-            end_last_episodes(self.replay_buffer)
-        result = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, *args, **kwargs)
-        check_from_environment(
-            self._last_obs if self._vec_normalize_env is None else self._last_original_obs, "observation", self.num_timesteps
-        )
-        return result
-
-    def _sample_action(
-        self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
-    ) -> tuple[np.ndarray, np.ndarray]:
-        try:
-            action, buffer_action = super()._sample_action(learning_starts, action_noise, n_envs)
-        except TrainingDivergedError as error:
-            raise TrainingDivergedError(error.quantity, error.value, self._n_updates) from None
-        if not is_finite(buffer_action):
-            # The policy's own actions are looked at in predict()
-            raise ValueError(f"action_noise gave an action of NaN at step {self.num_timesteps}: {action_noise}")
-        return action, buffer_action
-
-    def _store_transition(self, replay_buffer, buffer_action, new_obs, reward, dones, infos) -> None:
-        # Before anything is written: one NaN would spread from the buffer to every network and to the graph
-        normalizer = self._vec_normalize_env
-        # What is stored: infinity was clipped in what was normalised
-        check_from_environment(new_obs if normalizer is None else normalizer.old_obs, "observation", self.num_timesteps)
-        check_from_environment(reward if normalizer is None else normalizer.old_reward, "reward", self.num_timesteps)
-        for info, done in zip(infos, dones, strict=True):
-            if done and info.get("terminal_observation") is not None:
-                check_from_environment(info["terminal_observation"], "terminal observation", self.num_timesteps)
-        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
 
     def _excluded_save_params(self) -> list[str]:
         return super()._excluded_save_params() + [  # noqa: RUF005

@@ -11,6 +11,7 @@ LAYERS = [
     {"zoo", "datasets"},
     {"__init__"},
     {"causalgdp"},
+    {"checked", "callbacks.own"},
     {"saving.algorithm", "callbacks.pictures"},
     {"callbacks", "checkpoints", "knowledge"},
     {"callbacks.world_model", "updates"},
