@@ -2,9 +2,7 @@
 
 import difflib
 import inspect
-import os
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import gymnasium as gym
@@ -20,17 +18,37 @@ from stable_baselines3.common.vec_env import VecEnv
 from torch import nn
 
 from sb3_causalgdp.causal.discovery import DISCOVERY_METHODS
+from sb3_causalgdp.causal.guidance import GUIDANCE_TARGETS
 from sb3_causalgdp.diffusion.denoiser_types import DENOISERS
 from sb3_causalgdp.diffusion.guidance import GUIDANCE_COVARIANCES, GUIDANCE_MODES
 from sb3_causalgdp.diffusion.plans import SAMPLERS
 from sb3_causalgdp.diffusion.schedules import NOISE_SCHEDULES
+from sb3_causalgdp.kinds import (
+    FLAG,
+    FUNCTION,
+    KEYWORDS,
+    LONGEST,
+    NONE,
+    PATH,
+    TEXT,
+    Kind,
+    NotAcceptedError,
+    accepts,
+    as_text,
+    choice,
+    instance,
+    integer,
+    number,
+    schedule,
+    sequence,
+    subclass,
+)
 from sb3_causalgdp.offline.rewards import REWARD_TRANSFORMS
 
 ACTOR_UPDATES = ("one_step", "chain", "weighted", "imitation", "trust_region")
 CRITIC_NORMALIZATIONS = ("batch", "layer")
 PREDICTION_TYPES = ("noise", "velocity")
 Q_SCALES = ("value", "advantage")
-GUIDANCE_TARGETS = ("return", "reward")
 
 # Rates and weights: their squares, and those of what they scale, stay inside float32
 LARGEST_WEIGHT = 1e6
@@ -43,167 +61,11 @@ MOST_DIFFUSION_STEPS = 1_000
 MOST_CANDIDATES = 10_000
 MOST_THREADS = 1_024
 WIDEST_LAYER = 65_536
-MOST_LAYERS = 100
+MOST_LAYERS = LONGEST
 MOST_CRITICS = 100
 MOST_NAMES = 1_000_000
 LARGEST_NOISE = 10.0
 ACTION_PRECISION = 1e-3  # of an action's half range
-
-
-class NotAcceptedError(ValueError):
-    """A value is not of a kind."""
-
-
-@dataclass(frozen=True)
-class Kind:
-    """
-    What an argument accepts.
-
-    :param accepted: In words, to stand behind "must be"
-    :param read: Gives what is to be stored, or raises :class:`NotAcceptedError`
-    """
-
-    accepted: str
-    read: Callable[[Any], Any]
-
-    def __or__(self, other: "Kind") -> "Kind":
-        def read(value: Any) -> Any:
-            try:
-                return self.read(value)
-            except NotAcceptedError:
-                return other.read(value)
-
-        return Kind(f"{self.accepted} or {other.accepted}", read)
-
-
-def _accepts(accepted: str, condition: Callable[[Any], bool], convert: Callable[[Any], Any] = lambda value: value) -> Kind:
-    def read(value: Any) -> Any:
-        if not condition(value):
-            raise NotAcceptedError
-        return convert(value)
-
-    return Kind(accepted, read)
-
-
-def _text(number: float) -> str:
-    return f"{number:,}" if isinstance(number, int) else f"{number:g}"
-
-
-def integer(low: int, high: int) -> Kind:
-    """
-    :param low: The smallest
-    :param high: The largest
-    :return: Integers, also numpy's, which become Python's
-    """
-
-    def condition(value: Any) -> bool:
-        return isinstance(value, (int, np.integer)) and not isinstance(value, bool) and bool(low <= value <= high)
-
-    return _accepts(f"an integer from {_text(low)} to {_text(high)}", condition, int)
-
-
-def number(low: float, high: float, above: bool = False) -> Kind:
-    """
-    :param low: The smallest
-    :param high: The largest
-    :param above: Whether it has to be larger than ``low``
-    :return: Numbers, also numpy's, which become Python's
-    """
-
-    def condition(value: Any) -> bool:
-        if not isinstance(value, (int, float, np.integer, np.floating)) or isinstance(value, bool):
-            return False
-        return bool((low < value if above else low <= value) and value <= high)
-
-    return _accepts(
-        f"a number above {_text(low)} and at most {_text(high)}" if above else f"a number from {_text(low)} to {_text(high)}",
-        condition,
-        lambda value: value if type(value) is int else float(value),
-    )
-
-
-NONE = _accepts("None", lambda value: value is None)
-FLAG = _accepts("True or False", lambda value: isinstance(value, (bool, np.bool_)), bool)
-TEXT = _accepts("a string", lambda value: isinstance(value, str))
-PATH = _accepts("a path", lambda value: isinstance(value, (str, os.PathLike)) and str(value) != "")
-KEYWORDS = _accepts(
-    "a dictionary with strings as keys",
-    lambda value: isinstance(value, Mapping) and all(isinstance(key, str) for key in value),
-    dict,
-)
-FUNCTION = _accepts("a function", callable)
-
-
-def choice(names: Iterable[str]) -> Kind:
-    """
-    :param names: Known names
-    :return: One of these
-    """
-    known = sorted(names)
-    accepted = repr(known[0]) if len(known) == 1 else f"one of {known}"
-    return _accepts(accepted, lambda value: isinstance(value, str) and value in known)
-
-
-def subclass(of: type, words: str) -> Kind:
-    """
-    :param of: A class
-    :param words: What its subclasses are called
-    :return: The class or a subclass
-    """
-    return _accepts(words, lambda value: isinstance(value, type) and issubclass(value, of))
-
-
-def instance(of: type | tuple[type, ...], words: str) -> Kind:
-    """
-    :param of: A class, or several
-    :param words: What its instances are called
-    :return: Instances of it
-    """
-    return _accepts(words, lambda value: isinstance(value, of))
-
-
-def schedule(kind: Kind) -> Kind:
-    """
-    :param kind: What the values have to be
-    :return: A number, or a function of the progress that remains, of which the first value is looked at
-    """
-
-    def read(value: Any) -> Any:
-        if not callable(value):
-            return kind.read(value)
-        try:
-            first = value(1.0)
-            kind.read(first.item() if isinstance(first, (np.ndarray, th.Tensor)) else first)
-        except (TypeError, ValueError, AttributeError) as error:
-            raise NotAcceptedError from error
-        return value
-
-    return Kind(f"{kind.accepted}, or a function that gives such numbers for the progress remaining (from 1 to 0)", read)
-
-
-def sequence(
-    kind: Kind, words: str, shortest: int = 0, longest: int = MOST_LAYERS, equal: bool = False, different: bool = False
-) -> Kind:
-    """
-    :param kind: What each element has to be
-    :param words: What the sequence is called
-    :param shortest: The smallest length
-    :param longest: The largest length
-    :param equal: Whether all elements have to be the same
-    :param different: Whether none may be the same as another
-    :return: Lists, also tuples and arrays, which become lists
-    """
-
-    def read(value: Any) -> Any:
-        if not isinstance(value, (list, tuple, np.ndarray)) or not shortest <= len(value) <= longest:
-            raise NotAcceptedError
-        elements = [kind.read(element) for element in value]
-        n_different = len(set(map(str, elements)))
-        if (equal and n_different > 1) or (different and n_different < len(elements)):
-            raise NotAcceptedError
-        return elements
-
-    return Kind(words, read)
 
 
 def _read_train_freq(value: Any) -> Any:
@@ -268,7 +130,7 @@ SHARE = number(0.0, 1.0)
 NAMES = sequence(TEXT, "a list of names, each another one", 1, MOST_NAMES, different=True)
 WEIGHT = number(0.0, LARGEST_WEIGHT)
 RATE = schedule(WEIGHT)
-LAYERS_ACCEPTED = f"a list of at most {MOST_LAYERS} layer sizes from 1 to {_text(WIDEST_LAYER)}"
+LAYERS_ACCEPTED = f"a list of at most {MOST_LAYERS} layer sizes from 1 to {as_text(WIDEST_LAYER)}"
 LAYERS = sequence(integer(1, WIDEST_LAYER), LAYERS_ACCEPTED)
 
 
@@ -278,14 +140,17 @@ def _read_networks(value: Any) -> Any:
     return {key: LAYERS.read(layers) for key, layers in value.items()}
 
 
-# The policy has them, too
-SHARED_ARGUMENTS: dict[str, Kind] = {
+CANDIDATES = integer(1, MOST_CANDIDATES)
+NOISE = number(0.0, LARGEST_NOISE)
+
+# The policy has these, too
+DIFFUSION_ARGUMENTS: dict[str, Kind] = {
     "diffusion_steps": integer(1, MOST_DIFFUSION_STEPS),
     "noise_schedule": choice(NOISE_SCHEDULES),
     "sampler": choice(SAMPLERS),
     "ddim_eta": SHARE,
-    "n_action_candidates": integer(1, MOST_CANDIDATES),
-    "exploration_noise": number(0.0, LARGEST_NOISE),
+}
+GUIDANCE_ARGUMENTS: dict[str, Kind] = {
     "guidance": choice(GUIDANCE_MODES) | NONE,
     "guidance_target": choice(GUIDANCE_TARGETS),
     "guidance_covariance": choice(GUIDANCE_COVARIANCES),
@@ -294,65 +159,79 @@ SHARED_ARGUMENTS: dict[str, Kind] = {
     "outcome_guidance_scale": WEIGHT,
 }
 
-CONSTRUCTOR_ARGUMENTS: dict[str, Kind] = {
-    "policy": TEXT | subclass(BasePolicy, "a policy class"),
-    "env": TEXT | instance((gym.Env, VecEnv), "an environment") | NONE,
-    "learning_rate": RATE,
-    "buffer_size": integer(1, 10 * MOST_STEPS),
-    "learning_starts": integer(0, MOST_STEPS),
-    "batch_size": integer(1, MOST_GRADIENT_STEPS),
-    "tau": SHARE,
-    "gamma": SHARE,
-    "train_freq": Kind(f"{STEPS.accepted}, or a tuple of one and 'step' or 'episode'", _read_train_freq),
-    "gradient_steps": integer(-1, MOST_GRADIENT_STEPS),
-    "action_noise": instance(ActionNoise, "an ActionNoise") | NONE,
-    "replay_buffer_class": subclass(ReplayBuffer, "a subclass of ReplayBuffer") | NONE,
-    "replay_buffer_kwargs": KEYWORDS | NONE,
-    "optimize_memory_usage": FLAG,
-    "n_steps": integer(1, MOST_CANDIDATES),
-    "critic_learning_rate": RATE | NONE,
-    "world_model_learning_rate": RATE,
-    "eta": WEIGHT,
-    "denoising_weight": WEIGHT,
-    "actor_update": choice(ACTOR_UPDATES),
-    "q_scale": choice(Q_SCALES),
-    "expectile": number(0.0, 1.0, above=True) | NONE,
-    "advantage_temperature": WEIGHT,
-    "improvement_step": number(0.0, 2.0, above=True),
-    "bound_penalty": WEIGHT,
-    "policy_delay": STEPS,
-    "world_model_delay": STEPS,
-    "target_policy_noise": number(0.0, LARGEST_NOISE),
-    "target_noise_clip": number(0.0, LARGEST_NOISE),
-    "max_q_backup": FLAG,
-    "max_grad_norm": number(0.0, LARGEST_NUMBER, above=True) | NONE,
-    **SHARED_ARGUMENTS,
-    "exploration_noise": schedule(number(0.0, LARGEST_NOISE)),
-    "causal_discovery": choice(DISCOVERY_METHODS) | FUNCTION,
-    "causal_discovery_kwargs": KEYWORDS | NONE,
-    "causal_refresh_freq": STEPS,
-    "causal_half_life": number(1.0, LARGEST_NUMBER) | NONE,
-    "causal_window": integer(8, MOST_STEPS) | NONE,
-    "sample_masks": FLAG,
-    "causal_abstraction": FLAG | KEYWORDS,
-    "state_names": NAMES | NONE,
-    "action_names": NAMES | NONE,
-    "offline_dataset": PATH | NONE,
-    "pretrain_steps": integer(0, MOST_PRETRAIN_STEPS),
-    "offline_fraction": schedule(SHARE),
-    "reward_transform": choice(REWARD_TRANSFORMS),
-    "stats_window_size": integer(1, MOST_STEPS),
-    "tensorboard_log": PATH | NONE,
-    "policy_kwargs": KEYWORDS | NONE,
-    "compile": FLAG | _accepts("a mode of torch.compile", lambda value: isinstance(value, str) and value != ""),
-    "cuda_graph": FLAG | choice(["auto"]),
-    "torch_threads": integer(1, MOST_THREADS) | choice(["auto"]) | NONE,
-    "verbose": integer(0, MOST_STEPS) | FLAG,
-    "seed": integer(0, 2**32 - 1) | NONE,
-    "device": Kind("'auto' or a device that PyTorch has here, such as 'cpu' or 'cuda:0'", _read_device),
-    "_init_setup_model": FLAG,
+GROUPS: dict[str, dict[str, Kind]] = {
+    "Environment and policy": {
+        "policy": TEXT | subclass(BasePolicy, "a policy class"),
+        "env": TEXT | instance((gym.Env, VecEnv), "an environment") | NONE,
+        "policy_kwargs": KEYWORDS | NONE,
+        "seed": integer(0, 2**32 - 1) | NONE,
+        "verbose": integer(0, MOST_STEPS) | FLAG,
+        "device": Kind("'auto' or a device that PyTorch has here, such as 'cpu' or 'cuda:0'", _read_device),
+        "compile": FLAG | accepts("a mode of torch.compile", lambda value: isinstance(value, str) and value != ""),
+        "cuda_graph": FLAG | choice(["auto"]),
+        "torch_threads": integer(1, MOST_THREADS) | choice(["auto"]) | NONE,
+        "tensorboard_log": PATH | NONE,
+        "stats_window_size": integer(1, MOST_STEPS),
+        "_init_setup_model": FLAG,
+    },
+    "Collecting and updating": {
+        "learning_rate": RATE,
+        "critic_learning_rate": RATE | NONE,
+        "world_model_learning_rate": RATE,
+        "buffer_size": integer(1, 10 * MOST_STEPS),
+        "batch_size": integer(1, MOST_GRADIENT_STEPS),
+        "learning_starts": integer(0, MOST_STEPS),
+        "train_freq": Kind(f"{STEPS.accepted}, or a tuple of one and 'step' or 'episode'", _read_train_freq),
+        "gradient_steps": integer(-1, MOST_GRADIENT_STEPS),
+        "tau": SHARE,
+        "gamma": SHARE,
+        "n_steps": integer(1, MOST_CANDIDATES),
+        "action_noise": instance(ActionNoise, "an ActionNoise") | NONE,
+        "exploration_noise": schedule(NOISE),
+        "replay_buffer_class": subclass(ReplayBuffer, "a subclass of ReplayBuffer") | NONE,
+        "replay_buffer_kwargs": KEYWORDS | NONE,
+        "optimize_memory_usage": FLAG,
+    },
+    "Actor and critics": {
+        "denoising_weight": WEIGHT,
+        "eta": WEIGHT,
+        "actor_update": choice(ACTOR_UPDATES),
+        "q_scale": choice(Q_SCALES),
+        "expectile": number(0.0, 1.0, above=True) | NONE,
+        "advantage_temperature": WEIGHT,
+        "improvement_step": number(0.0, 2.0, above=True),
+        "bound_penalty": WEIGHT,
+        "policy_delay": STEPS,
+        "world_model_delay": STEPS,
+        "target_policy_noise": NOISE,
+        "target_noise_clip": NOISE,
+        "max_q_backup": FLAG,
+        "max_grad_norm": number(0.0, LARGEST_NUMBER, above=True) | NONE,
+        "n_action_candidates": CANDIDATES,
+    },
+    "Diffusion": DIFFUSION_ARGUMENTS,
+    "Guidance": GUIDANCE_ARGUMENTS,
+    "Causal discovery": {
+        "causal_discovery": choice(DISCOVERY_METHODS) | FUNCTION,
+        "causal_discovery_kwargs": KEYWORDS | NONE,
+        "causal_refresh_freq": STEPS,
+        "sample_masks": FLAG,
+        "causal_abstraction": FLAG | KEYWORDS,
+        "causal_half_life": number(1.0, LARGEST_NUMBER) | NONE,
+        "causal_window": integer(8, MOST_STEPS) | NONE,
+        "state_names": NAMES | NONE,
+        "action_names": NAMES | NONE,
+    },
+    "Offline data": {
+        "offline_dataset": PATH | NONE,
+        "pretrain_steps": integer(0, MOST_PRETRAIN_STEPS),
+        "offline_fraction": schedule(SHARE),
+        "reward_transform": choice(REWARD_TRANSFORMS),
+    },
 }
-"""Every argument of :class:`~sb3_causalgdp.CausalGDP`."""
+"""Every argument of :class:`~sb3_causalgdp.CausalGDP`, by what it is about, as ``docs/guide/arguments.md`` has them."""
+
+CONSTRUCTOR_ARGUMENTS: dict[str, Kind] = {name: kind for group in GROUPS.values() for name, kind in group.items()}
 
 DISTILLATION_ARGUMENTS: dict[str, Kind] = {
     "n_observations": STEPS,
@@ -371,7 +250,7 @@ POLICY_ARGUMENTS: dict[str, Kind] = {
     "features_extractor_class": subclass(BaseFeaturesExtractor, "a subclass of BaseFeaturesExtractor"),
     "features_extractor_kwargs": KEYWORDS | NONE,
     "normalize_images": FLAG,
-    "optimizer_class": _accepts(
+    "optimizer_class": accepts(
         "a subclass of torch.optim.Optimizer whose step() needs no closure",
         lambda value: isinstance(value, type) and issubclass(value, th.optim.Optimizer) and _needs_no_closure(value),
     ),
@@ -385,7 +264,10 @@ POLICY_ARGUMENTS: dict[str, Kind] = {
         integer(1, WIDEST_LAYER), f"a list of 1 to {MOST_LAYERS} equal layer sizes, like [128, 128],", shortest=1, equal=True
     )
     | NONE,
-    **SHARED_ARGUMENTS,
+    "n_action_candidates": CANDIDATES,
+    "exploration_noise": NOISE,
+    **DIFFUSION_ARGUMENTS,
+    **GUIDANCE_ARGUMENTS,
     "sampling_steps": integer(1, MOST_DIFFUSION_STEPS) | NONE,
     "denoiser": choice(DENOISERS) | subclass(nn.Module, "a class of torch.nn"),
     "denoiser_kwargs": KEYWORDS | NONE,

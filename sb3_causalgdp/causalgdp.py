@@ -19,7 +19,9 @@ from stable_baselines3.common.utils import FloatSchedule, update_learning_rate
 from sb3_causalgdp.acceleration.gradients import check_compile
 from sb3_causalgdp.arguments import (
     CONSTRUCTOR_ARGUMENTS,
+    DIFFUSION_ARGUMENTS,
     DISTILLATION_ARGUMENTS,
+    GUIDANCE_ARGUMENTS,
     POLICY_ARGUMENTS,
     check_action_space,
     check_arguments,
@@ -376,11 +378,7 @@ class CausalGDP(AskedAlgorithm, CheckedAlgorithm):
         self._check_together()
 
     def _own_policy_kwargs(self) -> dict[str, Any]:
-        names = (
-            "diffusion_steps noise_schedule sampler ddim_eta n_action_candidates guidance guidance_target "
-            "guidance_covariance guidance_scale state_guidance_scale outcome_guidance_scale"
-        ).split()
-        own = {name: getattr(self, name) for name in names}
+        own = {name: getattr(self, name) for name in ("n_action_candidates", *DIFFUSION_ARGUMENTS, *GUIDANCE_ARGUMENTS)}
         own["exploration_noise"] = FloatSchedule(self.exploration_noise)(1.0)
         networks = {"one_pass": self.actor_update == "trust_region", "value_network": self.expectile is not None}
         asked = {name: True for name, is_asked in networks.items() if is_asked}

@@ -1,6 +1,7 @@
 """Checks of arguments and arrays that several classes make."""
 
 import math
+from collections.abc import MutableMapping
 from typing import Any
 
 import numpy as np
@@ -75,3 +76,20 @@ def check_from_environment(values: Any, name: str, step: int) -> None:
             f"The environment returned a {what} at step {step}, index {list(where)}: "
             f"{values[where]}. Nothing of this step was stored; see VecCheckNan to find its origin."
         )
+
+
+def register(registry: MutableMapping[str, Any], name: str, entry: Any, what: str) -> None:
+    """
+    Add to a table of names.
+
+    :param registry: The table
+    :param name: The new name, an identifier of Python
+    :param entry: What it stands for
+    :param what: What the table's entries are called
+    :raises ValueError: If the name stands for something else already, or is no identifier
+    """
+    if not (isinstance(name, str) and name.isidentifier()):
+        raise ValueError(f"name must be an identifier such as 'my_{what.replace(' ', '_')}', got {name!r}")
+    if registry.get(name, entry) is not entry:
+        raise ValueError(f"name must be new: there is a {what} {name!r} already, {registry[name]!r}")
+    registry[name] = entry

@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch as th
@@ -89,10 +89,14 @@ class CausalGDPPolicy(AbstractingPolicy):
         acting
     :param value_network: Whether the critics have a network V(s) beside them
     :param causal_abstraction: Whether components of observations and actions can be hidden from actor and critics, see
-        :meth:`show`
+        :meth:`~sb3_causalgdp.abstraction.AbstractingPolicy.show`
     """
 
     candidate_noise: th.Tensor
+
+    # What networks are made of: a subclass may have its own
+    actor_class: ClassVar[type[DiffusionActor]] = DiffusionActor
+    critic_class: ClassVar[type[Critic]] = Critic
 
     def __init__(
         self,
@@ -263,10 +267,10 @@ class CausalGDPPolicy(AbstractingPolicy):
                 raise ValueError(f"optimizer_kwargs={self.optimizer_kwargs!r} do not fit: {error}") from error
 
     def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> DiffusionActor:
-        return DiffusionActor(**self._update_features_extractor(self.actor_kwargs, features_extractor)).to(self.device)
+        return self.actor_class(**self._update_features_extractor(self.actor_kwargs, features_extractor)).to(self.device)
 
     def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> Critic:
-        return Critic(**self._update_features_extractor(self.critic_kwargs, features_extractor)).to(self.device)
+        return self.critic_class(**self._update_features_extractor(self.critic_kwargs, features_extractor)).to(self.device)
 
     def make_features_extractor(self) -> BaseFeaturesExtractor:
         extractor = super().make_features_extractor()

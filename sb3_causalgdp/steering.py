@@ -9,8 +9,8 @@ from stable_baselines3.common.torch_layers import CombinedExtractor, FlattenExtr
 from stable_baselines3.common.type_aliases import PyTorchObs
 from torch import nn
 
-from sb3_causalgdp.causal import CausalGuidance, LinearisedGuidance, MaskedWorldModel, ReturnTarget, RewardTarget
-from sb3_causalgdp.causal.guidance import OutcomeTarget
+from sb3_causalgdp.causal import CausalGuidance, LinearisedGuidance, MaskedWorldModel
+from sb3_causalgdp.causal.guidance import GUIDANCE_TARGETS
 from sb3_causalgdp.diffusion import GuidanceRule
 from sb3_causalgdp.extractors import StandardizedExtractor
 from sb3_causalgdp.networks import Critic, DiffusionActor, q_values
@@ -161,13 +161,7 @@ class SteeredPolicy(SavedPolicy):
         :param critic: The critic that the return target climbs; None takes the smallest Q of all
         :return: The guidance for these states
         """
-        outcome: OutcomeTarget
-        if self.guidance_target == "return":
-            outcome = ReturnTarget(
-                lambda predicted: self.value_gradient(predicted, next_action, critic), self.discount, self.return_std
-            )
-        else:
-            outcome = RewardTarget(self.reward_target)
+        outcome = GUIDANCE_TARGETS[self.guidance_target](self, next_action, critic)
         return CausalGuidance(
             self.world_model, state, next_state, outcome, self.state_guidance_scale, self.outcome_guidance_scale
         )
@@ -184,7 +178,7 @@ class SteeredPolicy(SavedPolicy):
         response = self.world_model.action_response(state, action)
         next_state = response.next_state
         next_action = action
-        if self.guidance_target == "return" and not self.has_image_state:
+        if self.guidance_target != "reward" and not self.has_image_state:
             features = self._features_of_state(next_state, self.actor.features_extractor)
             # The next state is near: one step of the denoiser stands for a chain
             next_action = self.actor.adapt(features, action)

@@ -45,7 +45,7 @@ LAYERS = [
         "saving.archives",
         "extractors",
     },
-    {"saving.numpy_pickles", "acceleration.switch", "acceleration", "saving", "moved", "presets"},
+    {"kinds", "saving.numpy_pickles", "acceleration.switch", "acceleration", "saving", "moved", "presets"},
 ]
 # Graphs and answers are drawn by pictures that know them: this file imports those late, and no other does
 LATE = {("causal.drawing", "causal.plots")}

@@ -144,6 +144,7 @@ class NumpyActing(_Views):
             and policy.device.type in ("cpu", "cuda")
             and type(policy.observation_space) is spaces.Box
             and not policy.has_image_state
+            and policy.guidance_target in ("return", "reward")
             and _shows_vectors(policy.actor.features_extractor)
             and _shows_vectors(policy.critic_target.features_extractor)
             and activation in ACTIVATIONS

@@ -13,9 +13,19 @@ if TYPE_CHECKING:
         make_discovery,
         make_statistics,
         min_rows,
+        register_discovery_method,
     )
     from sb3_causalgdp.causal.graph import CausalGraph
-    from sb3_causalgdp.causal.guidance import CausalGuidance, LinearisedGuidance, ReturnTarget, RewardTarget
+    from sb3_causalgdp.causal.guidance import (
+        GUIDANCE_TARGETS,
+        CausalGuidance,
+        LinearisedGuidance,
+        OutcomeTarget,
+        OutcomeTerm,
+        ReturnTarget,
+        RewardTarget,
+        register_guidance_target,
+    )
     from sb3_causalgdp.causal.interventions import (
         ActionEffects,
         Counterfactual,
@@ -38,13 +48,16 @@ __getattr__, __dir__ = lazy_names(
             name: "sb3_causalgdp.causal.discovery"
             for name in (
                 *("DISCOVERY_METHODS", "DiscoveryMethod", "Statistics"),
-                *("discover", "make_discovery", "make_statistics", "min_rows"),
+                *("discover", "make_discovery", "make_statistics", "min_rows", "register_discovery_method"),
             )
         },
         "CausalGraph": "sb3_causalgdp.causal.graph",
         **{
             name: "sb3_causalgdp.causal.guidance"
-            for name in ("CausalGuidance", "LinearisedGuidance", "ReturnTarget", "RewardTarget")
+            for name in (
+                *("GUIDANCE_TARGETS", "CausalGuidance", "LinearisedGuidance", "OutcomeTarget", "OutcomeTerm"),
+                *("ReturnTarget", "RewardTarget", "register_guidance_target"),
+            )
         },
         **{
             name: "sb3_causalgdp.causal.interventions"
@@ -64,6 +77,7 @@ __getattr__, __dir__ = lazy_names(
 
 __all__ = [
     "DISCOVERY_METHODS",
+    "GUIDANCE_TARGETS",
     "ActionEffects",
     "CausalGraph",
     "CausalGuidance",
@@ -73,6 +87,8 @@ __all__ = [
     "InterventionalDistribution",
     "LinearisedGuidance",
     "MaskedWorldModel",
+    "OutcomeTarget",
+    "OutcomeTerm",
     "Relevance",
     "RelevanceGate",
     "ReturnTarget",
@@ -87,4 +103,6 @@ __all__ = [
     "make_discovery",
     "make_statistics",
     "min_rows",
+    "register_discovery_method",
+    "register_guidance_target",
 ]

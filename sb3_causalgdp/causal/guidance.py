@@ -1,12 +1,12 @@
 """The gradient of the masked world model's log density by the action: what steers the sampler."""
 
 from collections.abc import Callable
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import torch as th
 
 from sb3_causalgdp.causal.world_model import ActionResponse, MaskedWorldModel
-from sb3_causalgdp.checks import check_at_least_zero
+from sb3_causalgdp.checks import check_at_least_zero, register
 
 
 class OutcomeTerm(NamedTuple):
@@ -66,6 +66,51 @@ class ReturnTarget:
     def __call__(self, response: ActionResponse) -> OutcomeTerm:
         by_next_state = response.reward_by_next_state + self.discount * self.value_gradient(response.next_state)
         return OutcomeTerm(th.ones_like(response.reward), by_next_state / self.std, response.reward_by_action / self.std)
+
+
+class Judge(Protocol):
+    """What a target can be made from: the policy, and what it has measured."""
+
+    discount: float
+    return_std: th.Tensor
+    """Standard deviation of Q, shape ``()``."""
+    reward_target: th.Tensor
+    """A high quantile of the rewards seen, shape ``()``."""
+
+    def value_gradient(self, state: th.Tensor, action: th.Tensor, critic: int | None = None) -> th.Tensor:
+        """
+        :param state: Shape ``(batch, n)``
+        :param action: The action that follows, shape ``(batch, d)``
+        :param critic: Which Q, None for the smallest
+        :return: dQ / ds, shape ``(batch, n)``
+        """
+        ...  # pragma: no cover
+
+
+def _return_target(policy: Judge, next_action: th.Tensor, critic: int | None) -> OutcomeTarget:
+    return ReturnTarget(lambda state: policy.value_gradient(state, next_action, critic), policy.discount, policy.return_std)
+
+
+def _reward_target(policy: Judge, next_action: th.Tensor, critic: int | None) -> OutcomeTarget:
+    return RewardTarget(policy.reward_target)
+
+
+GUIDANCE_TARGETS: dict[str, Callable[[Any, th.Tensor, int | None], OutcomeTarget]] = {
+    "return": _return_target,
+    "reward": _reward_target,
+}
+
+
+def register_guidance_target(name: str, make: Callable[[Any, th.Tensor, int | None], OutcomeTarget]) -> None:
+    """
+    Let ``guidance_target=name`` be something else to wish for.
+
+    :param name: Its name
+    :param make: Takes the policy, the action that would follow in the next state (shape ``(batch, d)``) and which critic is
+        climbed (None for the smallest Q of all), and gives an :class:`OutcomeTarget`
+    :raises ValueError: If there is another target of that name
+    """
+    register(GUIDANCE_TARGETS, name, make, "guidance target")
 
 
 class CausalGuidance:

@@ -6,6 +6,7 @@ from typing import Any, Protocol
 import torch as th
 from torch import nn
 
+from sb3_causalgdp.checks import register
 from sb3_causalgdp.diffusion.denoisers import MLPDenoiser, ResidualMLPDenoiser
 from sb3_causalgdp.diffusion.transformer import TransformerDenoiser
 
@@ -14,6 +15,9 @@ DENOISERS: dict[str, Callable[..., nn.Module]] = {
     "residual_mlp": ResidualMLPDenoiser,
     "transformer": TransformerDenoiser,
 }
+
+
+_OWN_DENOISERS = tuple(DENOISERS.values())
 
 
 class DenoiserNetwork(Protocol):
@@ -42,6 +46,17 @@ class DenoiserNetwork(Protocol):
         ...  # pragma: no cover
 
 
+def register_denoiser(name: str, denoiser: type[nn.Module]) -> None:
+    """
+    Let ``policy_kwargs=dict(denoiser=name)`` be a network of one's own, also in YAML files. A class does without a name.
+
+    :param name: Its name
+    :param denoiser: As :class:`DenoiserNetwork` describes it
+    :raises ValueError: If there is another denoiser of that name
+    """
+    register(DENOISERS, name, denoiser, "denoiser")
+
+
 def make_denoiser(
     denoiser: str | type[nn.Module],
     action_dim: int,
@@ -68,7 +83,7 @@ def make_denoiser(
     if isinstance(denoiser, str) and denoiser not in DENOISERS:
         raise ValueError(f"Unknown denoiser {denoiser!r}: it must be one of {sorted(DENOISERS)} or a class of torch.nn")
     make = DENOISERS[denoiser] if isinstance(denoiser, str) else denoiser
-    is_own = make in DENOISERS.values()
+    is_own = make in _OWN_DENOISERS
     keywords = {**({"alpha_bar": alpha_bar} if is_own and alpha_bar is not None else {}), **(denoiser_kwargs or {})}
     try:
         network = make(action_dim, condition_dim, n_steps, net_arch, activation_fn, **keywords)

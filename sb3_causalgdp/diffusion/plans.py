@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 from itertools import pairwise
 from typing import NamedTuple
 
+from sb3_causalgdp.checks import register
 from sb3_causalgdp.diffusion.schedules import NoiseSchedule
 
 
@@ -212,16 +213,27 @@ def _dpm_solver(points: Sequence[Point], eta: float) -> list[Stage]:
     return stages
 
 
-_METHODS: dict[str, Callable[[Sequence[Point], float], list[Stage]]] = {
+SAMPLERS: dict[str, Callable[[Sequence[Point], float], list[Stage]]] = {
     "ddpm": lambda points, eta: _ancestral(points, 1.0),
     "ddim": _ancestral,
     "euler_maruyama": _euler_maruyama,
     "heun": _heun,
     "dpm_solver": _dpm_solver,
 }
-SAMPLERS = tuple(_METHODS)
 STOCHASTIC_SAMPLERS = ("ddpm", "euler_maruyama")
 SPACINGS = ("time", "log_snr")
+
+
+def register_sampler(name: str, method: Callable[[Sequence[Point], float], list[Stage]]) -> None:
+    """
+    Let ``sampler=name`` be a sampler of one's own: linear in the noisy action, the clean estimate and the one before it.
+
+    :param name: Its name
+    :param method: Takes the points in time, the last first, and ``eta``, and gives a :class:`Stage` for each evaluation of the
+        denoiser, all but the one at the point of the clean action
+    :raises ValueError: If there is another sampler of that name
+    """
+    register(SAMPLERS, name, method, "sampler")
 
 
 def sampling_plan(
@@ -239,5 +251,5 @@ def sampling_plan(
     key = sampler, eta, n_steps, spacing
     if key not in schedule.plans:
         points = sampling_points(schedule, n_steps, spacing)
-        schedule.plans[key] = [*_METHODS[sampler](points, eta), Stage(*points[0], is_last=True)]
+        schedule.plans[key] = [*SAMPLERS[sampler](points, eta), Stage(*points[0], is_last=True)]
     return schedule.plans[key]

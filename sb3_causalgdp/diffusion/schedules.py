@@ -7,6 +7,8 @@ import numpy as np
 import torch as th
 from torch import nn
 
+from sb3_causalgdp.checks import register
+
 
 def vp_betas(n_steps: int, beta_min: float = 0.1, beta_max: float = 10.0) -> th.Tensor:
     """
@@ -84,6 +86,17 @@ def at_step(table: th.Tensor, step: int | float | th.Tensor) -> th.Tensor:
         below = min(max(int(step), 0), last)
         return table[below].lerp(table[min(below + 1, last)], step - below)
     return table[step]
+
+
+def register_noise_schedule(name: str, betas: Callable[[int], th.Tensor]) -> None:
+    """
+    Let ``noise_schedule=name`` be a noise schedule of one's own.
+
+    :param name: Its name
+    :param betas: Gives beta_1 to beta_K for a number of diffusion steps K, shape ``(K,)``, in (0, 1)
+    :raises ValueError: If there is another noise schedule of that name
+    """
+    register(NOISE_SCHEDULES, name, betas, "noise schedule")
 
 
 class NoiseSchedule(nn.Module):

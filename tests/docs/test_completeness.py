@@ -17,6 +17,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 import sb3_causalgdp
 from sb3_causalgdp import CausalGDP, CausalWorldModelCallback
+from sb3_causalgdp.arguments import GROUPS
 from sb3_causalgdp.causal import CausalGraph, TransitionVariables
 from sb3_causalgdp.policies import CausalGDPPolicy
 
@@ -111,6 +112,15 @@ def test_every_argument_is_in_the_overview_and_in_the_docstring(owner):
     assert not set(parameters) - listed, "docs/guide/arguments.md lacks these"
     described = re.findall(r":param (\w+):", inspect.getdoc(owner) or "")
     assert described == parameters
+
+
+def test_the_overview_has_the_groups_of_the_table():
+    page = read("guide/arguments.md")
+    sections = re.split(r"^## ", page, flags=re.MULTILINE)[1:]
+    rows = {section.partition("\n")[0]: re.findall(r"^\| (`.*?) \|", section, re.MULTILINE) for section in sections}
+    for group, arguments in GROUPS.items():
+        shown = set(re.findall(r"`(\w+)`", " ".join(rows[group])))
+        assert shown == set(arguments) - {"_init_setup_model"}, group
 
 
 def test_the_overview_lists_no_argument_that_is_gone():

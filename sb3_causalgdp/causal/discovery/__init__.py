@@ -17,6 +17,7 @@ from sb3_causalgdp.causal.discovery.world_model import WorldModelEffects
 from sb3_causalgdp.causal.graph import CausalGraph
 from sb3_causalgdp.causal.statistics.moments import StreamingMoments
 from sb3_causalgdp.causal.variables import TransitionVariables
+from sb3_causalgdp.checks import register
 from sb3_causalgdp.sources.tables import Table
 
 __all__ = [
@@ -33,6 +34,7 @@ __all__ = [
     "make_discovery",
     "make_statistics",
     "min_rows",
+    "register_discovery_method",
 ]
 
 
@@ -65,6 +67,19 @@ DISCOVERY_METHODS: dict[str, type] = {
     "perturbed": Perturbed,
     "world_model": WorldModelEffects,
 }
+
+
+def register_discovery_method(name: str, method: type) -> None:
+    """
+    Let ``causal_discovery=name`` be a method of one's own, whose constructor takes ``causal_discovery_kwargs``.
+
+    A callable does without a name.
+
+    :param name: Its name
+    :param method: A class whose instances are a :class:`DiscoveryMethod`
+    :raises ValueError: If there is another method of that name
+    """
+    register(DISCOVERY_METHODS, name, method, "discovery method")
 
 
 def make_discovery(method: str | Callable[..., CausalGraph], /, **kwargs: Any) -> DiscoveryMethod:
