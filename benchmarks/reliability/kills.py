@@ -109,7 +109,11 @@ def writers() -> dict[str, tuple[Callable[[Path], Any], Callable[[Path], Any], s
     def write_data(path: Path) -> None:
         import shutil
 
-        shutil.rmtree(path, ignore_errors=True)
+        # At once: a removal that is killed half way is no fault of a writer
+        removed = path.with_name("removed")
+        shutil.rmtree(removed, ignore_errors=True)
+        if path.exists():
+            path.rename(removed)
         episode = Episode(np.zeros((501, 3), np.float32), np.zeros((500, 1), np.float32), np.zeros(500))
         write_dataset(path.name, [episode] * 20, "Pendulum-v1", path.parent)
 

@@ -18,19 +18,15 @@ from threadpoolctl import ThreadpoolController
 from torch import nn
 
 from sb3_causalgdp.acceleration import switch
-from sb3_causalgdp.acceleration.numpy_networks import (
+from sb3_causalgdp.acceleration.numpy_layers import (
     ACTIVATIONS,
     ONE,
-    Critics,
-    Denoiser,
-    Features,
-    Rule,
-    WorldModel,
     has_plain_layers,
     view,
     without_batch_norms,
     without_norms,
 )
+from sb3_causalgdp.acceleration.numpy_networks import Critics, Denoiser, Features, Rule, WorldModel
 from sb3_causalgdp.diffusion import MLPDenoiser
 from sb3_causalgdp.diffusion.plans import sampling_points
 from sb3_causalgdp.extractors import StandardizedExtractor

@@ -1,177 +1,34 @@
 """The networks of a policy, its chain of denoising and its guidance, in numpy, on the memory of PyTorch's tensors."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from functools import reduce
-from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
-import torch as th
 from torch import nn
 
-from sb3_causalgdp.acceleration.activations import fast
+from sb3_causalgdp.acceleration.numpy_layers import (
+    ACTIVATIONS,
+    ONE,
+    ROUNDING,
+    BatchNorm,
+    Layer,
+    LayerNorm,
+    clip,
+    constant,
+    layer_of,
+    linear_layers,
+    view,
+    without_batch_norms,
+    without_norms,
+)
 from sb3_causalgdp.causal.world_model import MaskedBlocks, MaskedWorldModel
 from sb3_causalgdp.diffusion import GuidanceRule
 from sb3_causalgdp.diffusion.plans import Point, Stage, sampling_plan, sampling_points
 from sb3_causalgdp.extractors import StandardizedExtractor
 
 Policy = Any  # a CausalGDPPolicy, whose file imports this one
-
-
-def _constant(value: float) -> np.ndarray:
-    # A product of a few numbers with an array of no dimension takes half the time of one with a Python number
-    return np.array(value, dtype=np.float32)
-
-
-_ZERO, ONE, _MINUS_ONE, _TWO = _constant(0.0), _constant(1.0), _constant(-1.0), _constant(2.0)
-_LARGEST_EXPONENT = _constant(20.0)
-_ROUNDING = _constant(8.0 * float(np.finfo(np.float32).eps))
-_SMALLEST_RESIDUAL_STD, _MOST_CHANGE = _constant(1e-4), _constant(4.0)  # those of MaskedWorldModel
-
-
-class Activation(NamedTuple):
-    """An activation and its derivative, the latter from the input and the output."""
-
-    value: Callable[[np.ndarray], np.ndarray]
-    derivative: Callable[[np.ndarray, np.ndarray], np.ndarray]
-
-
-def _sigmoid(x: np.ndarray) -> np.ndarray:
-    # By tanh, which does not overflow
-    return 0.5 * (1.0 + np.tanh(0.5 * x))
-
-
-def _tanh_of_softplus(x: np.ndarray) -> np.ndarray:
-    # tanh(log(1 + e)) = ((1 + e)^2 - 1) / ((1 + e)^2 + 1): one exponential; beyond 20 it is 1 in float32
-    exponential = np.minimum(x, _LARGEST_EXPONENT)
-    np.exp(exponential, out=exponential)
-    result = exponential + _TWO
-    result *= exponential
-    result /= result + _TWO
-    return result
-
-
-def _elu(x: np.ndarray) -> np.ndarray:
-    return np.maximum(x, _ZERO) + np.expm1(np.minimum(x, _ZERO))
-
-
-def _mish_derivative(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    squashed = _tanh_of_softplus(x)
-    return squashed + x * _sigmoid(x) * (1.0 - squashed * squashed)
-
-
-def _silu_derivative(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    gate = _sigmoid(x)
-    return gate + y * (1.0 - gate)
-
-
-ACTIVATIONS: dict[type[nn.Module], Activation] = {
-    nn.ReLU: Activation(lambda x: np.maximum(x, _ZERO), lambda x, y: y > _ZERO),
-    nn.Tanh: Activation(np.tanh, lambda x, y: ONE - y * y),
-    nn.Mish: Activation(lambda x: x * _tanh_of_softplus(x), _mish_derivative),
-    nn.ELU: Activation(_elu, lambda x, y: np.minimum(y, _ZERO) + ONE),
-    nn.SiLU: Activation(lambda x: x * _sigmoid(x), _silu_derivative),
-}
-
-
-def _clip(values: np.ndarray, lowest: np.ndarray = _MINUS_ONE, highest: np.ndarray = ONE) -> np.ndarray:
-    # Half of the time of ndarray.clip
-    raised = np.maximum(values, lowest)
-    return np.minimum(raised, highest, out=raised)
-
-
-Layer = tuple[np.ndarray, np.ndarray]
-"""A weight, shape ``(outputs, inputs)``, and a bias, shape ``(outputs, 1)``."""
-
-
-def view(tensor: th.Tensor) -> np.ndarray:
-    return tensor.detach().numpy()
-
-
-def _layer(linear: nn.Linear) -> Layer:
-    return view(linear.weight), view(linear.bias)[:, None]
-
-
-def _linear_layers(modules: Iterable[nn.Module]) -> list[Layer]:
-    return [_layer(module) for module in modules if isinstance(module, nn.Linear)]
-
-
-def has_plain_layers(modules: Iterable[nn.Module], activation: type[nn.Module]) -> bool:
-    """Whether there is nothing but layers with a bias and that activation."""
-    return all(
-        (isinstance(module, nn.Linear) and module.bias is not None) or type(module) in (activation, fast(activation))
-        for module in modules
-    )
-
-
-class _LayerNorm:
-    """``nn.LayerNorm`` of columns."""
-
-    def __init__(self, module: nn.LayerNorm) -> None:
-        self.weight, self.bias = view(module.weight)[:, None], view(module.bias)[:, None]
-        self.epsilon = np.float32(module.eps)
-
-    def __call__(self, values: np.ndarray) -> np.ndarray:
-        standardised, _ = self._standardise(values)
-        return self.weight * standardised + self.bias
-
-    def backward(self, gradient: np.ndarray, values: np.ndarray) -> np.ndarray:
-        """From the gradient by what came out, the one by the values that went in."""
-        standardised, inverse_std = self._standardise(values)
-        gradient = self.weight * gradient
-        along = (gradient * standardised).mean(axis=0)
-        return inverse_std * (gradient - gradient.mean(axis=0) - along * standardised)
-
-    def _standardise(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        centred = values - values.mean(axis=0)
-        inverse_std = 1.0 / np.sqrt((centred * centred).mean(axis=0) + self.epsilon)
-        return centred * inverse_std, inverse_std
-
-
-class _BatchNorm:
-    """``nn.BatchNorm1d`` of columns, by its running averages."""
-
-    def __init__(self, module: nn.BatchNorm1d) -> None:
-        assert module.running_mean is not None and module.running_var is not None
-        arrays = (module.weight, module.bias, module.running_mean, module.running_var)
-        self.weight, self.bias, self.mean, self.variance = (view(array)[:, None] for array in arrays)
-        self.epsilon = np.float32(module.eps)
-
-    def scale(self) -> np.ndarray:
-        return self.weight / np.sqrt(self.variance + self.epsilon)
-
-
-def without_batch_norms(network: nn.Sequential) -> tuple[list[nn.Module], list[nn.BatchNorm1d]]:
-    """The batch normalisations where each layer has one right in front of it, else none; and all other modules."""
-    modules = list(network)
-    norms = [norm for norm, layer in pairwise(modules) if isinstance(layer, nn.Linear) and _normalises_batches(norm, layer)]
-    if len(norms) != sum(isinstance(module, nn.Linear) for module in modules):
-        return modules, []
-    return [module for module in modules if not any(module is norm for norm in norms)], norms  # type: ignore[return-value]
-
-
-def _normalises_batches(module: nn.Module, layer: nn.Linear) -> bool:
-    return (
-        type(module) is nn.BatchNorm1d
-        and module.num_features == layer.in_features
-        and module.affine
-        and module.track_running_stats
-    )
-
-
-def without_norms(network: nn.Sequential | list[nn.Module]) -> tuple[list[nn.Module], list[nn.LayerNorm]]:
-    """The normalisations where each layer but the last has one right behind it, else none; and all other modules."""
-    modules = list(network)
-    norms = [after for layer, after in pairwise(modules[:-1]) if isinstance(layer, nn.Linear) and _normalises(after, layer)]
-    if len(norms) != sum(isinstance(module, nn.Linear) for module in modules) - 1:
-        return modules, []
-    return [module for module in modules if not any(module is norm for norm in norms)], norms  # type: ignore[return-value]
-
-
-def _normalises(module: nn.Module, layer: nn.Linear) -> bool:
-    if type(module) is not nn.LayerNorm or module.normalized_shape != (layer.out_features,):
-        return False
-    return module.weight is not None and module.bias is not None
+_SMALLEST_RESIDUAL_STD, _MOST_CHANGE = constant(1e-4), constant(4.0)  # those of MaskedWorldModel
 
 
 class _Move:
@@ -180,11 +37,11 @@ class _Move:
     def __init__(self, stage: Stage, predicts_velocity: bool) -> None:
         alpha_bar = stage.alpha_bar
         # a0_hat = clean_by_noisy a^k - clean_by_output (what the network gives: the noise or the velocity)
-        self.clean_by_noisy = _constant(alpha_bar ** (0.5 if predicts_velocity else -0.5))
-        self.clean_by_output = _constant((1.0 - alpha_bar if predicts_velocity else 1.0 / alpha_bar - 1.0) ** 0.5)
+        self.clean_by_noisy = constant(alpha_bar ** (0.5 if predicts_velocity else -0.5))
+        self.clean_by_output = constant((1.0 - alpha_bar if predicts_velocity else 1.0 / alpha_bar - 1.0) ** 0.5)
         self.std = stage.std
-        self.by = _constant(stage.by_clean), _constant(stage.by_noisy)
-        self.by_previous = _constant(stage.by_previous_clean), _constant(stage.by_previous_noisy)
+        self.by = constant(stage.by_clean), constant(stage.by_noisy)
+        self.by_previous = constant(stage.by_previous_clean), constant(stage.by_previous_noisy)
         self.reads_previous = stage.by_previous_clean != 0.0 or stage.by_previous_noisy != 0.0
         self.is_last = stage.is_last
 
@@ -220,13 +77,13 @@ class Denoiser:
 
     def __init__(self, policy: Policy) -> None:
         actor, denoiser = policy.actor, policy.actor.denoiser
-        weight, self.bias = _layer(denoiser.input_layer)
+        weight, self.bias = layer_of(denoiser.input_layer)
         first_time = denoiser.action_dim
         first_condition = first_time + denoiser.time_table.shape[1]
         self.action_weight, self.condition_weight = weight[:, :first_time], weight[:, first_condition:]
         self.time_weight = weight[:, first_time:first_condition]
         self.time_table = view(denoiser.time_table).T
-        self.time_layers, self.layers = _linear_layers(denoiser.time_mlp), _linear_layers(denoiser.network)
+        self.time_layers, self.layers = linear_layers(denoiser.time_mlp), linear_layers(denoiser.network)
         self.activation = ACTIVATIONS[actor.activation_fn].value
         schedule, predicts_velocity = actor.schedule, denoiser.velocity is not None
         stages = sampling_plan(schedule, actor.sampler, actor.ddim_eta, actor.sampling_steps)
@@ -241,7 +98,7 @@ class Denoiser:
         self.share = (steps - self.lower).astype(np.float32)[:, None, None]
         self.adapting_step = actor.adapting_step
         self.adapting = _Move(sampling_plan(schedule, "ddim")[-1 - actor.adapting_step], predicts_velocity)
-        self.adapting_signal = _constant(schedule.alpha_bar_list[actor.adapting_step] ** 0.5)
+        self.adapting_signal = constant(schedule.alpha_bar_list[actor.adapting_step] ** 0.5)
 
     def time_part(self) -> np.ndarray:
         """The diffusion steps' part of the first layer, bias included, shape ``(K, width, 1)``."""
@@ -291,8 +148,8 @@ class Denoiser:
                 predicted = self.predict(action, bound[point])
             clean = move.clean(action, predicted)
             if shift is not None:
-                clean += shift(_clip(clean), point)
-            clean = _clip(clean)
+                clean += shift(clip(clean), point)
+            clean = clip(clean)
             following = move.next(clean, action, scaled_noise[position], previous)
             previous, action, predicted = (clean, action), following, None
         return action
@@ -300,7 +157,7 @@ class Denoiser:
     def adapt(self, features: np.ndarray, action: np.ndarray, time_part: np.ndarray) -> np.ndarray:
         """:meth:`DiffusionActor.adapt`, features of shape ``(n, batch)``, actions ``(d, batch)``."""
         noisy = self.adapting_signal * action
-        return _clip(self.adapting.clean(noisy, self.predict(noisy, self.bind(features, time_part[self.adapting_step]))))
+        return clip(self.adapting.clean(noisy, self.predict(noisy, self.bind(features, time_part[self.adapting_step]))))
 
 
 class Features:
@@ -311,14 +168,14 @@ class Features:
         self.is_plain = not isinstance(extractor, StandardizedExtractor)
         if not self.is_plain:
             self.mean, self.inverse_std = view(extractor.mean)[:, None], view(extractor.inverse_std)[:, None]
-            self.bounds = _constant(-extractor.bound), _constant(extractor.bound)
+            self.bounds = constant(-extractor.bound), constant(extractor.bound)
 
     def __call__(self, state: np.ndarray) -> np.ndarray:
         if self.is_plain:
             return state
         standardized = state - self.mean
         standardized *= self.inverse_std
-        return _clip(standardized, *self.bounds)
+        return clip(standardized, *self.bounds)
 
     def backward(self, gradient: np.ndarray, features: np.ndarray) -> np.ndarray:
         """From the gradient by the features, the one by the states."""
@@ -344,9 +201,9 @@ class _Critic:
     def __init__(self, network: nn.Sequential, activation_fn: type[nn.Module]) -> None:
         modules, batch_norms = without_batch_norms(network)
         modules, norms = without_norms(modules)
-        self.layers = layers = _linear_layers(modules)
-        self.batch_norms = [_BatchNorm(norm) for norm in batch_norms]
-        self.norms: Sequence[_LayerNorm | None] = [_LayerNorm(norm) for norm in norms] or [None] * (len(layers) - 1)
+        self.layers = layers = linear_layers(modules)
+        self.batch_norms = [BatchNorm(norm) for norm in batch_norms]
+        self.norms: Sequence[LayerNorm | None] = [LayerNorm(norm) for norm in norms] or [None] * (len(layers) - 1)
         self.activation = ACTIVATIONS[activation_fn]
 
     def values(self, features: np.ndarray, actions: np.ndarray, n_candidates: int) -> np.ndarray:
@@ -380,7 +237,7 @@ class _Critic:
             layers.append((weight * scale.T, bias + weight.dot(norm.bias - norm.mean * scale)))
         return layers
 
-    def _hidden(self, norm: _LayerNorm | None, product: np.ndarray) -> _Hidden:
+    def _hidden(self, norm: LayerNorm | None, product: np.ndarray) -> _Hidden:
         normalised = product if norm is None else norm(product)
         return _Hidden(product, normalised, self.activation.value(normalised))
 
@@ -450,9 +307,9 @@ class WorldModel:
     def __init__(self, model: MaskedWorldModel) -> None:
         self.model = model
         self.transition, self.reward = _Blocks(model.transition), _Blocks(model.reward)
-        self.input_bounds = _constant(-model.INPUT_BOUND), _constant(model.INPUT_BOUND)
+        self.input_bounds = constant(-model.INPUT_BOUND), constant(model.INPUT_BOUND)
         lowest, highest = model.LOG_STD_BOUNDS
-        self.log_std_bounds = _constant(lowest), _constant(highest)
+        self.log_std_bounds = constant(lowest), constant(highest)
         self.arrays = {
             name: view(value) for name, value in (*model.named_buffers(recurse=False), *model.named_parameters(recurse=False))
         }
@@ -466,12 +323,12 @@ class WorldModel:
         change = np.minimum(arrays["change_variance"] / (state_std * state_std), _MOST_CHANGE)
         residual_std = np.maximum(np.sqrt(closed * closed + gate * change), _SMALLEST_RESIDUAL_STD)
         standardised = (state - arrays["state_mean"]) / state_std
-        inputs = np.concatenate([_clip(standardised, *self.input_bounds), action], axis=1)
+        inputs = np.concatenate([clip(standardised, *self.input_bounds), action], axis=1)
         mask = np.concatenate([arrays["state_to_state"], arrays["action_to_state"]], axis=1)
         change, jacobian = self.transition.forward_and_jacobian(inputs, mask, n_states)
         next_standardised = gate * standardised + residual_std * change
-        noise_std = np.exp(_clip(arrays["transition_log_std"], *self.log_std_bounds))
-        reward_inputs = np.concatenate([_clip(next_standardised, *self.input_bounds), action], axis=1)
+        noise_std = np.exp(clip(arrays["transition_log_std"], *self.log_std_bounds))
+        reward_inputs = np.concatenate([clip(next_standardised, *self.input_bounds), action], axis=1)
         reward_mask = np.concatenate([arrays["state_to_reward"], arrays["action_to_reward"]])[None]
         reward, reward_gradient = self.reward.forward_and_jacobian(reward_inputs, reward_mask, 0)
         reward_gradient = reward_scale * reward_gradient[0]
@@ -524,7 +381,7 @@ class Rule:
         if self.mode == "posterior":
             systems = self.identity + self.noise * curvature
             size = np.abs(systems).max(axis=(2, 3), keepdims=True)
-            systems += _ROUNDING * size * self.identity
+            systems += ROUNDING * size * self.identity
             both = self.factor * np.linalg.solve(systems, np.concatenate([curvature, at_zero], axis=2))
             slopes, offsets = both[..., :-1], both[..., -1:]
         else:

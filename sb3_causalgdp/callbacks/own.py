@@ -6,7 +6,7 @@ from stable_baselines3.common.logger import TensorBoardOutputFormat
 
 from sb3_causalgdp.callbacks.world_model import CausalWorldModelCallback
 from sb3_causalgdp.checkpoints import TrainingCheckpointCallback
-from sb3_causalgdp.checkpoints.checkpoint import all_callbacks
+from sb3_causalgdp.checkpoints.callback_states import all_callbacks
 
 PICTURE_BUDGET = 0.01
 """Share of the training's time that pictures in TensorBoard may take."""

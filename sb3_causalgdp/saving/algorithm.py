@@ -17,7 +17,8 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_causalgdp.checkpoints import TrainingCheckpointCallback, resume, save_checkpoint
-from sb3_causalgdp.checkpoints.checkpoint import all_callbacks, bookkeeping_of
+from sb3_causalgdp.checkpoints.callback_states import all_callbacks
+from sb3_causalgdp.checkpoints.checkpoint import bookkeeping_of
 from sb3_causalgdp.divergence import ParametersError, TrainingDivergedError, check_optimizer_state, first_not_finite
 from sb3_causalgdp.export import export_policy
 from sb3_causalgdp.files import write_bytes

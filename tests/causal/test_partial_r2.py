@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from sb3_causalgdp.causal import StreamingMoments, TransitionVariables, make_discovery
-from sb3_causalgdp.causal.discovery import DISCOVERY_METHODS, PartialR2, discover, make_statistics
-from sb3_causalgdp.causal.discovery import partial_r2 as module
-from sb3_causalgdp.causal.discovery.partial_r2 import edge_probability
+from sb3_causalgdp.causal.discovery import DISCOVERY_METHODS, PartialR2, discover, make_statistics, partial_r2
+from sb3_causalgdp.causal.discovery import regression as regressions
+from sb3_causalgdp.causal.discovery.evidence import edge_probability
 from sb3_causalgdp.causal.statistics.basis import BasisMoments
 from sb3_causalgdp.causal.statistics.jackknife import jackknife_error
 
@@ -59,7 +59,7 @@ def test_leaving_out_a_cause_equals_an_actual_refit(monkeypatch, equation, basis
     """The partial R^2 of every edge, and R^2, from least squares on the rows with and without the cause's features."""
     rows, method = rows_of(400), PartialR2(basis=basis)
     statistics, kept = statistics_of(rows, method), []
-    monkeypatch.setattr(module, "edge_probability", lambda partial, *_: kept.append(partial) or np.zeros_like(partial))
+    monkeypatch.setattr(partial_r2, "edge_probability", lambda partial, *_: kept.append(partial) or np.zeros_like(partial))
     graph = method(statistics, VARIABLES)
     which = ("dynamics", "reward").index(equation)
     expansion = statistics.expansions[which]
@@ -105,7 +105,7 @@ def test_an_even_function_has_an_edge_and_an_effect_where_notears_sees_nothing()
 def test_effects_without_products_need_few_of_the_newest_rows(monkeypatch):
     rows = rows_of(1000)
     graph = graph_of(rows, basis="additive")
-    monkeypatch.setattr(module, "THINNING", 2)
+    monkeypatch.setattr(regressions, "THINNING", 2)
     np.testing.assert_allclose(graph.effects, graph_of(rows, basis="additive").effects, atol=0.02)
 
 
@@ -237,7 +237,7 @@ def samples():
         return edge_probability(partial, log_error, *args)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(module, "edge_probability", keep)
+        patch.setattr(partial_r2, "edge_probability", keep)
         for seed in range(30):
             values.append([])
             graph = graph_of(rows_of(600, seed, noise=0.3), basis="additive")
@@ -302,8 +302,8 @@ def test_standard_errors_are_those_of_one_newton_step(n_rows):
 @pytest.mark.parametrize("kwargs", [{}, {"half_life": 300.0}, {"window": 800}])
 def test_the_scores_of_all_blocks_add_up_to_nothing(monkeypatch, basis, kwargs):
     """So that those of the last block need not be computed."""
-    found, parts = [], module._Regression.parts
-    monkeypatch.setattr(module._Regression, "parts", lambda self: found.append(self) or parts(self))
+    found, parts = [], regressions.Regression.parts
+    monkeypatch.setattr(regressions.Regression, "parts", lambda self: found.append(self) or parts(self))
     rows = rows_of(2000)
     rows[:, 2] = rows[:, 0] + 1e-3 * np.random.default_rng(1).standard_normal(2000)
     method = PartialR2(basis=basis)
@@ -382,7 +382,7 @@ def test_a_mask_is_the_probability_that_the_share_is_over_the_threshold():
 def test_an_unsure_edge_has_a_mask_further_from_zero_and_one(monkeypatch):
     rows = rows_of(150, noise=1.0)
     with_errors = graph_of(rows, spread=0.1)
-    monkeypatch.setattr(module, "jackknife_error", lambda whole, *_: np.zeros_like(whole))
+    monkeypatch.setattr(partial_r2, "jackknife_error", lambda whole, *_: np.zeros_like(whole))
     without = graph_of(rows, spread=0.1)
     sure = (without.masks > 0.99) | ((without.masks > 0.0) & (without.masks < 0.01))
     unsure = (with_errors.masks > 0.02) & (with_errors.masks < 0.98)
@@ -532,9 +532,11 @@ def test_actions_of_their_own_are_not_warned_of():
 def test_a_refresh_reads_as_much_after_many_rows_as_after_few(monkeypatch, kwargs, row_counts):
     method, read = PartialR2(basis="additive"), []
     statistics = make_statistics(method, VARIABLES, **kwargs)
-    scores = module._Regression._scores
+    scores = regressions.Regression._scores
     monkeypatch.setattr(
-        module._Regression, "_scores", lambda self, block: read[-1].append(block.comoment.size) or scores(self, block)
+        regressions.Regression,
+        "_scores",
+        lambda self, block: read[-1].append(block.comoment.size) or scores(self, block),
     )
     for n_rows in row_counts:
         rows = rows_of(n_rows)

@@ -4,7 +4,7 @@ from typing import NamedTuple
 import numpy as np
 import torch as th
 
-from sb3_causalgdp.causal.discovery.partial_r2 import edge_probability
+from sb3_causalgdp.causal.discovery.evidence import edge_probability
 from sb3_causalgdp.causal.graph import CausalGraph
 from sb3_causalgdp.causal.statistics.degenerate import LimitsFinder
 from sb3_causalgdp.causal.statistics.recent_rows import RecentRows, checked_rows
