@@ -1,17 +1,25 @@
-"""What the paper's theory says of the policy as it is: divergence by guidance (Theorem 1) and step size (Proposition 1)."""
+"""
+What is known of the policy as it is: by the paper's theory, divergence by guidance (Theorem 1) and step size (Proposition 1);
+and why it may not learn: its critics' errors, its dead units and its gradients.
+"""
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import numpy as np
 import torch as th
 from stable_baselines3.common.type_aliases import PyTorchObs
+from torch import nn
 
 from sb3_causalgdp.diffusion.guidance import guidance_shift
 from sb3_causalgdp.diffusion.samplers import bind
 from sb3_causalgdp.networks import smallest_q
 from sb3_causalgdp.policies import CausalGDPPolicy
 from sb3_causalgdp.prediction import act_in_torch, candidate_noise
+
+MOST_UNKNOWN = 0.15  # so that the first steps of 200 count at a discount of 0.99
+NO_ACTIVATIONS = (nn.Linear, nn.BatchNorm1d, nn.LayerNorm, nn.Dropout, nn.Embedding, nn.Identity)
 
 
 @th.no_grad()
@@ -76,6 +84,92 @@ def choice(policy: CausalGDPPolicy, observations: PyTorchObs) -> Choice:
     value = smallest_q(critic, critic_features, actions).mean()
     advantage = float(value - unguided) if policy.is_guided else 0.0
     return Choice(float(value), advantage, float(spread))
+
+
+def discounted_returns(rewards: np.ndarray, dones: np.ndarray, timeouts: np.ndarray, discount: float) -> np.ndarray:
+    """
+    What was really obtained from each step on.
+
+    :param rewards: Of consecutive steps of several environments, shape ``(T, n_envs)``
+    :param dones: Whether the episode ended there, the same shape
+    :param timeouts: Whether it was only cut there, the same shape
+    :param discount: Discount factor
+    :return: The same shape; NaN where more than 15 % of the weight of what follows is behind the episode's cut, or to come
+    """
+    returns, following = np.zeros(rewards.shape), np.zeros(rewards.shape[1])
+    # How much of the return lies behind what is known
+    unknown = np.ones(rewards.shape[1])
+    for step in range(len(rewards) - 1, -1, -1):
+        ended = dones[step] > 0.0
+        unknown = np.where(ended, np.where(timeouts[step] > 0.0, 1.0, 0.0), unknown) * discount
+        following = rewards[step] + discount * np.where(ended, 0.0, following)
+        returns[step] = np.where(unknown <= MOST_UNKNOWN, following, np.nan)
+    return returns
+
+
+@th.no_grad()
+def dead_units(policy: CausalGDPPolicy, observations: PyTorchObs) -> dict[str, float]:
+    """
+    Shares of hidden units that give the same for all observations (Sokar et al., 2023, https://arxiv.org/abs/2302.12902).
+
+    :param policy: A policy in evaluation mode
+    :param observations: A batch of observations
+    :return: Of the ``actor`` and the ``critic``; a network without hidden units is left out
+    """
+    features = policy.actor.features(observations)
+    noise = candidate_noise(policy, len(features), deterministic=True)[0, : len(features)]
+    actions = policy.actor.sample(features, candidate_noise(policy, len(features), deterministic=True)[:, : len(features)])
+    critic = policy.critic_target
+    inputs = th.cat([critic.extract_features(observations, critic.features_extractor), actions], dim=1)
+    calls: dict[str, list[tuple[nn.Module, tuple[Any, ...]]]] = {
+        "actor": [(policy.actor.denoiser, (noise, policy.actor.schedule.n_steps - 1, features))],
+        "critic": [(network, (inputs,)) for network in critic.q_networks],
+    }
+    shares = {}
+    for name, networks in calls.items():
+        is_dead = th.cat([_constant_units(network, arguments) for network, arguments in networks])
+        if len(is_dead) > 0:
+            shares[name] = float(is_dead.float().mean())
+    return shares
+
+
+def _constant_units(network: nn.Module, arguments: tuple[Any, ...]) -> th.Tensor:
+    """Which outputs of the activations do not vary over the batch, boolean, one for each unit."""
+    found: list[th.Tensor] = []
+
+    def look(module: nn.Module, inputs: Any, output: Any) -> None:
+        if isinstance(output, th.Tensor) and output.dim() == 2:
+            found.append(output.amax(dim=0) - output.amin(dim=0) <= 0.0)
+
+    activations = [module for module in network.modules() if not isinstance(module, NO_ACTIVATIONS) and _is_leaf(module)]
+    handles = [module.register_forward_hook(look) for module in activations]
+    try:
+        network(*arguments)
+    finally:
+        for handle in handles:
+            handle.remove()
+    return th.cat(found) if found else th.zeros(0, dtype=th.bool)
+
+
+def _is_leaf(module: nn.Module) -> bool:
+    return next(module.children(), None) is None
+
+
+def gradient_norm(optimizer: th.optim.Optimizer) -> float | None:
+    """
+    :param optimizer: Of one network
+    :return: Root mean square of the norm of its gradients over about the last ``1 / (1 - beta_2)`` updates (a thousand), which
+        Adam keeps anyway; None for other optimizers, and before the first update
+    """
+    total = None
+    for group in optimizer.param_groups:
+        for parameter in group["params"]:
+            state = optimizer.state.get(parameter, {})
+            if "exp_avg_sq" not in state:
+                return None
+            square = state["exp_avg_sq"].sum() / (1.0 - group["betas"][1] ** state["step"])
+            total = square if total is None else total + square
+    return None if total is None else math.sqrt(float(total))
 
 
 @dataclass(frozen=True)

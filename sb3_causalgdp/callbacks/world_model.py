@@ -13,7 +13,14 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.type_aliases import PyTorchObs
 
-from sb3_causalgdp.callbacks.diagnostics import choice, guidance_divergence, step_size_bound
+from sb3_causalgdp.callbacks.diagnostics import (
+    choice,
+    dead_units,
+    discounted_returns,
+    gradient_norm,
+    guidance_divergence,
+    step_size_bound,
+)
 from sb3_causalgdp.causal import Verdict, min_rows
 from sb3_causalgdp.causal.description import count_of_edges
 from sb3_causalgdp.causal.endings import states_that_end
@@ -39,6 +46,7 @@ class CausalWorldModelCallback(BaseCallback):
     FEED_ROWS = 10_000
     FEED_IMAGE_ROWS = 256
     HISTORY_ROWS = 20_000
+    RETURN_POSITIONS = 5_000
     OFFLINE_HISTORY_ROWS = 100_000
     ENDS_COMPARED = 2_000
 
@@ -218,6 +226,10 @@ class CausalWorldModelCallback(BaseCallback):
         """A batch as the policy sees it, straight from the arrays: a HER buffer cannot sample before an episode has ended."""
         rows = generator.randint(buffer.size(), size=self.diagnostics_batch_size)
         envs = generator.randint(buffer.n_envs, size=self.diagnostics_batch_size)
+        return self._observations_at(buffer, rows, envs)
+
+    def _observations_at(self, buffer: ReplayBuffer, rows: np.ndarray, envs: np.ndarray) -> PyTorchObs:
+        """As the policy sees them."""
         drawn: np.ndarray | dict[str, np.ndarray]
         if isinstance(buffer.observations, dict):
             drawn = {key: values[rows, envs] for key, values in buffer.observations.items()}
@@ -241,8 +253,35 @@ class CausalWorldModelCallback(BaseCallback):
         model.policy.set_training_mode(False)
         for name, value in choice(model.policy, observations)._asdict().items():
             self.logger.record(f"policy/{name}", value)
+        for name, value in dead_units(model.policy, observations).items():
+            self.logger.record(f"policy/dead_units_{name}", value)
+        for name, module in (("actor", model.actor), ("critic", model.critic), ("world_model", model.world_model)):
+            norm = gradient_norm(module.optimizer)
+            if norm is not None:
+                self.logger.record(f"train/{name}_gradient_norm", norm)
+        self._log_q_error()
         if model.policy.is_guided:
             self._log_guidance(observations)
+
+    def _log_q_error(self) -> None:
+        """How far the critics are from what was obtained in the newest episodes."""
+        model, buffer = self.model, self.model.replay_buffer
+        if model.is_pretraining or buffer is model.offline_buffer or not buffer.handle_timeout_termination:
+            return
+        n_positions = min(buffer.size(), self.RETURN_POSITIONS)
+        positions = np.arange(buffer.pos - n_positions, buffer.pos) % buffer.buffer_size
+        rewards = buffer._normalize_reward(buffer.rewards[positions], model._vec_normalize_env)
+        returns = discounted_returns(rewards, buffer.dones[positions], buffer.timeouts[positions], model.gamma)
+        known = np.argwhere(~np.isnan(returns))
+        if len(known) == 0:
+            return
+        chosen = known[np.linspace(0, len(known) - 1, min(len(known), self.diagnostics_batch_size)).astype(int)]
+        rows, envs = positions[chosen[:, 0]], chosen[:, 1]
+        observations = self._observations_at(buffer, rows, envs)
+        with th.no_grad():
+            values = model.policy.critic_target.smallest(observations, buffer.to_torch(buffer.actions[rows, envs]))
+        error = values.flatten().cpu().numpy() - returns[chosen[:, 0], chosen[:, 1]]
+        self.logger.record("policy/q_error", float(error.mean()))
 
     def _log_guidance(self, observations: PyTorchObs) -> None:
         model = self.model

@@ -1,12 +1,23 @@
 from itertools import pairwise
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
+from small_models import SMALL
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import Logger
 
-from sb3_causalgdp import MlpPolicy
-from sb3_causalgdp.callbacks.diagnostics import choice, guidance_divergence, step_size_bound
+from sb3_causalgdp import CausalGDP, CausalWorldModelCallback, MlpPolicy
+from sb3_causalgdp.callbacks.diagnostics import (
+    choice,
+    dead_units,
+    discounted_returns,
+    gradient_norm,
+    guidance_divergence,
+    step_size_bound,
+)
 
 
 def make_policy(**kwargs):
@@ -114,3 +125,92 @@ def test_posterior_guidance_is_less_steep_than_the_plain_score(observations):
     score, posterior = (bound(observations, guidance=name, **steep) for name in ("score", "posterior"))
     assert score.guidance_lipschitz > 10 * posterior.guidance_lipschitz
     assert score.guidance_exceeds
+
+
+# Why it may not learn -----------------------------------------------------------------------------------------------------
+
+
+def test_returns_are_those_that_were_obtained():
+    rewards = np.array([[1.0, 1.0, 1.0]] * 6)
+    dones, timeouts = np.zeros((6, 3)), np.zeros((6, 3))
+    dones[2], timeouts[2, 1] = [1, 1, 0], 1
+    returns = discounted_returns(rewards, dones, timeouts, 0.5)
+    # Of an episode that ended, all is known; of one that was cut or goes on, only where little can follow
+    np.testing.assert_allclose(returns[:3, 0], [1.75, 1.5, 1.0])
+    np.testing.assert_array_equal(np.isnan(returns[:3, 1]), [False, True, True])
+    assert returns[0, 1] == 1.75
+    np.testing.assert_allclose(returns[:4, 2], [1.96875, 1.9375, 1.875, 1.75])
+    assert np.isnan(returns[4:]).all()
+
+
+@pytest.mark.parametrize("activation_fn", ["relu", "tanh", "mish"])
+@pytest.mark.parametrize("kwargs", [{}, {"denoiser": "residual_mlp", "critic_normalization": "layer"}], ids=str)
+def test_units_that_do_not_vary_are_dead(activation_fn, kwargs, observations):
+    policy = make_policy(activation_fn=activation_fn, **kwargs)
+    policy.set_training_mode(False)
+    alive = dead_units(policy, observations)
+    if activation_fn != "relu":
+        assert alive == {"actor": 0.0, "critic": 0.0}
+    with th.no_grad():
+        for network in policy.critic_target.q_networks:
+            layer = next(module for module in network if isinstance(module, th.nn.Linear))
+            layer.weight[:4], layer.bias[:4] = 0.0, -1.0
+            for norm in network:
+                if isinstance(norm, th.nn.LayerNorm):
+                    norm.weight[:4] = 0.0
+    dead = dead_units(policy, observations)
+    assert dead["critic"] >= max(4 / 16, alive["critic"])
+    assert dead["actor"] == alive["actor"]
+
+
+def test_gradient_norms_are_those_of_the_last_updates():
+    network = th.nn.Linear(3, 2)
+    optimizer = th.optim.Adam(network.parameters(), lr=0.0)
+    assert gradient_norm(optimizer) is None
+    for factor in (3.0, 4.0):
+        for parameter in network.parameters():
+            parameter.grad = factor * th.ones_like(parameter) / 8**0.5
+        optimizer.step()
+    assert gradient_norm(optimizer) == pytest.approx((25.0 / 2.0) ** 0.5, rel=1e-2)
+    assert gradient_norm(th.optim.SGD(network.parameters(), lr=0.1)) is None
+
+
+class Ones(gym.Env):
+    """A reward of 1 in each of ten steps, and the time that is left to be seen."""
+
+    observation_space, action_space = spaces.Box(0.0, 1.0, (1,)), spaces.Box(-1.0, 1.0, (1,))
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.left = 10
+        return np.array([1.0], np.float32), {}
+
+    def step(self, action):
+        self.left -= 1
+        return np.array([self.left / 10], np.float32), 1.0, self.left == 0, False, {}
+
+
+def test_the_error_of_q_is_logged_and_is_that_of_the_critics():
+    model = CausalGDP("MlpPolicy", Ones(), **{**SMALL, "causal_refresh_freq": 50})
+    logged = {}
+
+    class Constant(BaseCallback):
+        """Critics that say 20."""
+
+        def _on_step(self):
+            with th.no_grad():
+                for network in model.critic_target.q_networks:
+                    network[-1].weight.zero_()
+                    network[-1].bias.fill_(20.0)
+            return True
+
+    class Remembering(Logger):
+        def record(self, key, value, exclude=None):
+            logged.setdefault(key, []).append(value)
+
+    model.set_logger(Remembering(None, []))
+    callback = CausalWorldModelCallback(min_transitions=30, diagnostics_batch_size=1000)
+    model.learn(50, callback=[Constant(), callback])
+    obtained = (1 - 0.99 ** np.arange(1, 11)) / 0.01
+    assert logged["policy/q_error"] == [pytest.approx(20.0 - obtained.mean(), rel=1e-3)]
+    assert set(logged) >= {"policy/dead_units_actor", "policy/dead_units_critic", "train/actor_gradient_norm"}
