@@ -435,8 +435,8 @@ class CausalGDP(AskedAlgorithm, CheckedAlgorithm):
 
     def _gradient_steps(self, plans: Sequence[StepPlan], replay_data: Any, *one_step: Any) -> Losses:
         """
-        Gradient steps of which only the last may train the actor. The TD targets of all are computed at once, with the target
-        networks as they are before the first.
+        Gradient steps of which only the last may train the actor. The next actions of all, and where there are target critics
+        the TD targets, are computed at once, with the networks as they are before the first.
 
         :param plans: What each step updates
         :param replay_data: Batches of the critics, one behind the other, and of the others unless they have their own
@@ -446,9 +446,9 @@ class CausalGDP(AskedAlgorithm, CheckedAlgorithm):
         updates, losses = self._updates, defaultdict(list)
         beside_critics = updates.beside_critics()
         # The next actions are those at the end of the chain of the actor's moving average
-        next_actions, target = updates.td_target(replay_data)
-        for plan, batch in updates.dealt(plans, replay_data, one_step, next_actions, target):
-            of_step = updates.update_critics(batch.replay_data, batch.target, plan.running_weight)
+        next_actions, for_critics = updates.bootstrap(replay_data)
+        for plan, batch in updates.dealt(plans, replay_data, one_step, next_actions, for_critics):
+            of_step = updates.update_critics(batch.replay_data, batch.for_critics, plan.running_weight)
             if plan.trains_world_model:
                 with beside_critics():
                     of_step |= updates.update_world_model(batch.transitions, plan.running_weight)

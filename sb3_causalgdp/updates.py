@@ -58,8 +58,8 @@ class StepBatch(NamedTuple):
 
     replay_data: Any
     """Of the critics: a sample of a replay buffer."""
-    target: th.Tensor
-    """What :meth:`Updates.td_target` gave for these rows."""
+    for_critics: th.Tensor
+    """What :meth:`Updates.bootstrap` gave for these rows."""
     transitions: Any
     """Of the world model and the actor: the same sample, or one of single steps where returns are of several."""
     next_actions: th.Tensor | None
@@ -165,23 +165,27 @@ class Updates:
 
     @staticmethod
     def dealt(
-        plans: Sequence[StepPlan], replay_data: Any, one_step: Sequence[Any], next_actions: th.Tensor | None, target: th.Tensor
+        plans: Sequence[StepPlan],
+        replay_data: Any,
+        one_step: Sequence[Any],
+        next_actions: th.Tensor | None,
+        for_critics: th.Tensor,
     ) -> Iterator[tuple[StepPlan, StepBatch]]:
         """
         :param plans: Of some gradient steps
         :param replay_data: Batches of the critics, one behind the other
         :param one_step: A batch for each step that trains more than the critics, none if ``replay_data`` is for all
         :param next_actions: After ``replay_data``, None if they are not known yet
-        :param target: TD target of ``replay_data``
+        :param for_critics: What :meth:`bootstrap` gave for them
         :return: Each plan with its batch
         """
-        batch_size, of_others = len(target) // len(plans), iter(one_step)
+        batch_size, of_others = len(for_critics) // len(plans), iter(one_step)
         for index, plan in enumerate(plans):
             rows = slice(index * batch_size, (index + 1) * batch_size)
             own = rows_of(replay_data, rows)
             single = next(of_others, None) if plan.trains_others else None
             others = (single, None) if single is not None else (own, None if next_actions is None else next_actions[rows])
-            yield plan, StepBatch(own, target[rows], *others)
+            yield plan, StepBatch(own, for_critics[rows], *others)
 
     def beside_critics(self) -> Callable[[], AbstractContextManager[None]]:
         """
@@ -191,20 +195,19 @@ class Updates:
 
     # Critics --------------------------------------------------------------------------------------------------------------
 
-    def td_target(self, replay_data) -> tuple[th.Tensor | None, th.Tensor]:
+    def bootstrap(self, replay_data) -> tuple[th.Tensor | None, th.Tensor]:
         """
         :param replay_data: Sample of a replay buffer
-        :return: Actions in the next states, shape ``(batch, d)``, None where a value network is asked; and the TD target with
-            them, shape ``(batch, 1)``, or, where critics normalise batches, the actions of which they say it themselves, shape
-            ``(batch, d)``
+        :return: Actions in the next states, shape ``(batch, d)``, None where a value network is asked; and what critics learn
+            from: the TD target, shape ``(batch, 1)``, or, where they normalise batches, the next actions for which they say it
+            themselves in :meth:`critic_gradients`, shape ``(batch, d)``
         """
         n_actions = self.N_BACKUP_ACTIONS if self.model.max_q_backup else 1
         next_observations = replay_data.next_observations
         actor = self.actor if self.critic.normalizes_batches else self.actor_target
         with th.no_grad():
             if self.model.expectile is not None:
-                values = [self.critic.value(next_observations)]
-                return None, td_target(values, replay_data.rewards, replay_data.dones, self.discounts(replay_data))
+                return None, self.td_target([self.critic.value(next_observations)], replay_data)
             actor_features = actor.features(next_observations).repeat_interleave(n_actions, dim=0)
             next_actions = actor.sample(actor_features)
             if self.critic.normalizes_batches:
@@ -212,8 +215,17 @@ class Updates:
             critic_features = self.critic_target.extract_features(next_observations, self.critic_target.features_extractor)
             critic_features, smoothed = critic_features.repeat_interleave(n_actions, dim=0), self.smoothed(next_actions)
             next_q_values = q_values(self.critic_target, critic_features, smoothed)
-            target = td_target(next_q_values, replay_data.rewards, replay_data.dones, self.discounts(replay_data), n_actions)
-        return next_actions[::n_actions], target
+        return next_actions[::n_actions], self.td_target(next_q_values, replay_data, n_actions)
+
+    def td_target(self, next_q_values: list[th.Tensor], replay_data, n_actions: int = 1) -> th.Tensor:
+        """
+        :param next_q_values: Of the next states, one for each critic, shape ``(n_actions * batch, 1)``
+        :param replay_data: Sample of a replay buffer
+        :param n_actions: Number of actions that are tried in each next state
+        :return: What Q should be, without a gradient, shape ``(batch, 1)``
+        """
+        with th.no_grad():
+            return td_target(next_q_values, replay_data.rewards, replay_data.dones, self.discounts(replay_data), n_actions)
 
     def discounts(self, replay_data) -> th.Tensor | float:
         """
@@ -233,27 +245,28 @@ class Updates:
         noise = model.target_policy_noise * th.randn_like(actions)
         return (actions + noise.clamp(-model.target_noise_clip, model.target_noise_clip)).clamp(-1.0, 1.0)
 
-    def update_critics(self, replay_data, target: th.Tensor, running_weight: float) -> Losses:
+    def update_critics(self, replay_data, for_critics: th.Tensor, running_weight: float) -> Losses:
         """
         :param replay_data: Sample of a replay buffer
-        :param target: What :meth:`td_target` gave
+        :param for_critics: What :meth:`bootstrap` gave
         :param running_weight: Share of the target's standard deviation that enters the running one
         :return: The loss
         """
         with self.critic.batch_statistics():
-            target_std, loss, gradients = self.critic_gradients(replay_data, target)
+            target_std, loss, gradients = self.critic_gradients(replay_data, for_critics)
         self.step(self.critic, gradients)
         with th.no_grad():
             self.policy.return_std.lerp_(target_std, running_weight)
         return {"critic_loss": loss}
 
-    def critic_gradients(self, replay_data, target: th.Tensor) -> tuple[th.Tensor, th.Tensor, Gradients]:
+    def critic_gradients(self, replay_data, for_critics: th.Tensor) -> tuple[th.Tensor, th.Tensor, Gradients]:
         observations, actions = replay_data.observations, replay_data.actions
         if self.critic.normalizes_batches:
-            q, next_q = self.critic.forward_both(observations, actions, replay_data.next_observations, target)
-            target = td_target(next_q, replay_data.rewards, replay_data.dones, self.discounts(replay_data))
+            # CrossQ: no target critics, (s, a) and (s', a') in one batch
+            q, next_q = self.critic.forward_both(observations, actions, replay_data.next_observations, for_critics)
+            target = self.td_target(next_q, replay_data)
         else:
-            q = self.critic(observations, actions)
+            q, target = self.critic(observations, actions), for_critics
         target_std, target_mean = th.std_mean(target, correction=0)
         target_std = th.where(moves(target_std, target_mean), target_std, 1.0)
         loss = critic_loss(q, target)

@@ -12,3 +12,15 @@ SMALL: dict[str, Any] = {
     "device": "cpu",
     "policy_kwargs": {"net_arch": [16], "world_model_net_arch": [16, 16]},
 }
+
+# Else all actions would lie on their bounds, and be the same for that reason
+SPREAD: dict[str, Any] = {"learning_rate": 1e-2, "eta": 0.01, "denoising_weight": 1.0, "n_action_candidates": 3}
+
+
+def small(policy_kwargs: dict[str, Any] | None = None, **changes: Any) -> dict[str, Any]:
+    """
+    :param policy_kwargs: Of the policy, beside small networks
+    :param changes: Further arguments
+    :return: All of a small model
+    """
+    return {**SMALL, **changes, "policy_kwargs": {**SMALL["policy_kwargs"], **(policy_kwargs or {})}}

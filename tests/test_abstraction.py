@@ -214,7 +214,7 @@ def test_hidden_actions_are_in_no_target_loss_or_value(normalization, actor_upda
     results = []
     for batch in (data, other):
         th.manual_seed(0)
-        next_actions, target = updates.td_target(batch)
+        next_actions, target = updates.bootstrap(batch)
         assert not next_actions[:, 2].any() and next_actions[:, :2].any()
         _, loss, by_critic = updates.critic_gradients(batch, target)
         losses, by_actor = updates.actor_gradients(batch, next_actions, 0, False)

@@ -4,21 +4,13 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium import spaces
+from small_models import small
 from stable_baselines3.common.envs import FakeImageEnv
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_causalgdp import CausalGDP, CausalWorldModelCallback
 
-KWARGS = {
-    "learning_starts": 30,
-    "batch_size": 16,
-    "train_freq": 8,
-    "buffer_size": 500,
-    "causal_refresh_freq": 1_000,
-    "seed": 0,
-    "device": "cpu",
-    "policy_kwargs": {"net_arch": [16], "world_model_net_arch": [16, 16]},
-}
+KWARGS = small(learning_starts=30, batch_size=16, buffer_size=500, causal_refresh_freq=1_000)
 TORQUE = "action[0]"
 
 

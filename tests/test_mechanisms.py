@@ -1,26 +1,16 @@
 """What fails when a mechanism is taken out."""
 
-from typing import Any
-
 import numpy as np
 import pytest
 import torch as th
+from small_models import small
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 
 from sb3_causalgdp import CausalGDP, CausalWorldModelCallback
 from sb3_causalgdp.updates import StepPlan
 
-KWARGS: dict[str, Any] = {
-    "learning_starts": 50,
-    "batch_size": 16,
-    "train_freq": 4,
-    "buffer_size": 1000,
-    "causal_refresh_freq": 100,
-    "seed": 0,
-    "device": "cpu",
-    "policy_kwargs": {"net_arch": [32], "world_model_net_arch": [16]},
-}
+KWARGS = small(learning_starts=50, batch_size=16, train_freq=4, causal_refresh_freq=100)
 
 WITH_TARGET_CRITICS = {**KWARGS, "policy_kwargs": {**KWARGS["policy_kwargs"], "critic_normalization": None}}
 
@@ -276,7 +266,7 @@ def next_actions_of(actor, data):
 def test_td_target_is_the_smallest_target_critic_at_the_moving_averages_action(disagreeing):
     model, data = disagreeing
     th.manual_seed(7)
-    next_actions, target = model._updates.td_target(data)
+    next_actions, target = model._updates.bootstrap(data)
     assert th.equal(next_actions, next_actions_of(model.actor_target, data))
     assert not th.allclose(next_actions, next_actions_of(model.actor, data))
 
@@ -298,7 +288,7 @@ def test_backup_over_several_actions_takes_the_best_of_them(disagreeing):
     model.max_q_backup = True
     n_actions = model._updates.N_BACKUP_ACTIONS
     th.manual_seed(7)
-    _, target = model._updates.td_target(data)
+    _, target = model._updates.bootstrap(data)
     repeated = data.next_observations.repeat_interleave(n_actions, dim=0)
     th.manual_seed(7)
     actions = model.actor_target.sample(model.actor_target.features(repeated))

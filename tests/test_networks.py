@@ -88,7 +88,7 @@ def test_critics_that_normalise_batches_are_their_own_targets():
     assert model.critic_target is model.critic
     data = samples()
     th.manual_seed(3)
-    next_actions, judged = model._updates.td_target(data)
+    next_actions, judged = model._updates.bootstrap(data)
     th.manual_seed(3)
     assert th.equal(next_actions, model.actor.sample(model.actor.features(data.next_observations)))
     assert th.equal(judged, next_actions)

@@ -3,6 +3,7 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
+from small_models import small
 from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.envs import BitFlippingEnv, FakeImageEnv, SimpleMultiObsEnv
@@ -11,17 +12,6 @@ from stable_baselines3.common.utils import obs_as_tensor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize, VecTransposeImage, is_vecenv_wrapped
 
 from sb3_causalgdp import CausalGDP, CausalWorldModelCallback
-
-KWARGS = {
-    "learning_starts": 20,
-    "batch_size": 8,
-    "train_freq": 8,
-    "buffer_size": 200,
-    "causal_refresh_freq": 60,
-    "seed": 0,
-    "device": "cpu",
-}
-POLICY_KWARGS = {"net_arch": [16], "world_model_net_arch": [16, 16]}
 
 
 class SampledEnv(gym.Env):
@@ -51,7 +41,7 @@ def guided_callback():
 
 
 def learn(env, policy="MlpPolicy", total_timesteps=64, policy_kwargs=None, **kwargs):
-    model = CausalGDP(policy, env, policy_kwargs={**POLICY_KWARGS, **(policy_kwargs or {})}, **{**KWARGS, **kwargs})
+    model = CausalGDP(policy, env, **small(policy_kwargs, **{"buffer_size": 200, **kwargs}))
     model.learn(total_timesteps, callback=guided_callback())
     assert model.policy.is_guided and model._n_updates > 0
     assert all(bool(th.isfinite(value).all()) for value in model.policy.state_dict().values())
@@ -101,7 +91,7 @@ def test_the_moments_get_every_transition_as_the_environment_gave_it(name, n_env
     """Discrete parts one-hot, in the order of the names, whatever the buffer's shapes are."""
     env = make_vec_env(lambda: SampledEnv(SPACES[name][0]), n_envs=n_envs, seed=0)
     policy = "MultiInputPolicy" if name == "Dict" else "MlpPolicy"
-    model = CausalGDP(policy, env, policy_kwargs=POLICY_KWARGS, **{**KWARGS, "learning_starts": 99})
+    model = CausalGDP(policy, env, **small(buffer_size=200, learning_starts=99))
     fed, update = [], model.causal_statistics.update
     model.causal_statistics.update = lambda rows: fed.append(rows) or update(rows)
     callback = CausalWorldModelCallback(refresh_freq=30, min_transitions=1000)
@@ -253,8 +243,7 @@ def test_hindsight_replay_whose_first_episode_outlasts_the_first_refresh(tmp_pat
         "MultiInputPolicy",
         make_env(),
         replay_buffer_class=HerReplayBuffer,
-        policy_kwargs=POLICY_KWARGS,
-        **{**KWARGS, "learning_starts": 1000, "guidance_scale": 0.1},
+        **small(buffer_size=200, learning_starts=1000, guidance_scale=0.1),
     )
     model.env.envs[0].unwrapped.desired_goal = np.full(3, 2)  # never reached
     model.learn(64, callback=guided_callback())

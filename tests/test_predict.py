@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
+from small_models import SPREAD, small
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.preprocessing import get_flattened_obs_dim
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
@@ -12,23 +13,7 @@ from torch import nn
 
 from sb3_causalgdp import CausalGDP, CausalWorldModelCallback
 
-KWARGS = {
-    "learning_starts": 20,
-    "batch_size": 16,
-    "train_freq": 8,
-    "gradient_steps": 2,
-    "buffer_size": 1000,
-    # Else all actions would lie on their bounds, and be the same for that reason
-    "learning_rate": 1e-2,
-    "eta": 0.01,
-    "denoising_weight": 1.0,
-    "policy_delay": 1,
-    "n_action_candidates": 3,
-    "causal_refresh_freq": 60,
-    "seed": 0,
-    "device": "cpu",
-}
-POLICY_KWARGS = {"net_arch": [16], "world_model_net_arch": [16, 16]}
+KWARGS = {**SPREAD, "batch_size": 16, "gradient_steps": 2, "policy_delay": 1}
 
 
 class BatchNormDropoutExtractor(BaseFeaturesExtractor):
@@ -48,8 +33,7 @@ EXTRACTORS = {
 
 
 def train(total_timesteps=128, policy_kwargs=None, **kwargs):
-    policy_kwargs = {**POLICY_KWARGS, **(policy_kwargs or {})}
-    model = CausalGDP("MlpPolicy", "Pendulum-v1", policy_kwargs=policy_kwargs, **{**KWARGS, **kwargs})
+    model = CausalGDP("MlpPolicy", "Pendulum-v1", **small(policy_kwargs, **{**KWARGS, **kwargs}))
     return model.learn(total_timesteps, callback=CausalWorldModelCallback(min_transitions=40))
 
 
@@ -174,9 +158,7 @@ def test_targets_copy_batch_norm_statistics_and_stay_in_evaluation_mode(extracto
 
 def test_collecting_leaves_batch_norm_statistics_alone():
     model = train(policy_kwargs=EXTRACTORS["batch norm and dropout"], gradient_steps=0, total_timesteps=64)
-    fresh = CausalGDP(
-        "MlpPolicy", "Pendulum-v1", policy_kwargs={**POLICY_KWARGS, **EXTRACTORS["batch norm and dropout"]}, **KWARGS
-    )
+    fresh = CausalGDP("MlpPolicy", "Pendulum-v1", **small(EXTRACTORS["batch norm and dropout"], **KWARGS))
     assert_same_tensors(batch_norm_statistics(model.policy), batch_norm_statistics(fresh.policy))
 
 
@@ -208,7 +190,7 @@ class MatrixEnv(gym.Env):
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_actions_have_the_spaces_shape_and_type(dtype):
-    model = CausalGDP("MlpPolicy", MatrixEnv(dtype), policy_kwargs=POLICY_KWARGS, **KWARGS)
+    model = CausalGDP("MlpPolicy", MatrixEnv(dtype), **small(**KWARGS))
     model.learn(64, callback=CausalWorldModelCallback(min_transitions=40))
     assert model.policy.is_guided
     observation = model.observation_space.sample()
@@ -223,14 +205,14 @@ def test_actions_have_the_spaces_shape_and_type(dtype):
 
 def test_vectorised_environments_get_an_action_each():
     env = make_vec_env("Pendulum-v1", n_envs=3, seed=0)
-    model = CausalGDP("MlpPolicy", env, policy_kwargs=POLICY_KWARGS, **KWARGS)
+    model = CausalGDP("MlpPolicy", env, **small(**KWARGS))
     actions, _ = model.predict(env.reset(), deterministic=True)
     assert actions.shape == (3, 1)
     env.step(actions)
 
 
 def test_what_reset_returns_is_not_an_observation():
-    model = CausalGDP("MlpPolicy", "Pendulum-v1", policy_kwargs=POLICY_KWARGS, **KWARGS)
+    model = CausalGDP("MlpPolicy", "Pendulum-v1", **small(**KWARGS))
     with pytest.raises(ValueError, match="mixing Gym API"):
         model.predict(gym.make("Pendulum-v1").reset())
     with pytest.raises(ValueError, match="Unexpected observation shape"):

@@ -7,19 +7,13 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
+from small_models import small
 
 from sb3_causalgdp import CausalGDP, MlpPolicy, preset
 from sb3_causalgdp.acceleration.acting import OnePassActing
 from sb3_causalgdp.presets import METHODS, OFFLINE, PRESETS
 
-SMALL = {
-    "learning_starts": 210,
-    "causal_refresh_freq": 205,
-    "batch_size": 32,
-    "n_action_candidates": 4,
-    "seed": 0,
-    "policy_kwargs": {"net_arch": [16, 16], "world_model_net_arch": [8, 8]},
-}
+KWARGS = small(learning_starts=210, causal_refresh_freq=205, batch_size=32, train_freq=1, n_action_candidates=4)
 
 
 class Aim(gym.Env):
@@ -46,7 +40,7 @@ def vector(module):
 @pytest.mark.parametrize("guided", [False, True])
 @pytest.mark.parametrize("name", PRESETS)
 def test_each_trains_from_an_environment(name, guided):
-    model = CausalGDP("MlpPolicy", "Pendulum-v1", **preset(name, guided=guided, **SMALL))
+    model = CausalGDP("MlpPolicy", "Pendulum-v1", **preset(name, guided=guided, **KWARGS))
     before = vector(model.actor), vector(model.critic)
     model.learn(400)
     assert model.policy.is_guided is guided
@@ -58,7 +52,7 @@ def test_each_trains_from_an_environment(name, guided):
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory):
     path = tmp_path_factory.mktemp("data") / "pendulum.npz"
-    model = CausalGDP("MlpPolicy", "Pendulum-v1", **{**SMALL, "learning_starts": 1_000})
+    model = CausalGDP("MlpPolicy", "Pendulum-v1", **{**KWARGS, "learning_starts": 1_000})
     model.learn(400)
     model.save_replay_buffer(path)
     return str(path)
@@ -68,7 +62,7 @@ def dataset(tmp_path_factory):
 @pytest.mark.parametrize("name", PRESETS)
 def test_each_trains_offline_with_its_papers_settings(name, guided, dataset):
     model = CausalGDP(
-        "MlpPolicy", "Pendulum-v1", **preset(name, offline=True, guided=guided, **SMALL), offline_dataset=dataset
+        "MlpPolicy", "Pendulum-v1", **preset(name, offline=True, guided=guided, **KWARGS), offline_dataset=dataset
     )
     before = vector(model.actor)
     model.pretrain(gradient_steps=30)
@@ -119,7 +113,7 @@ def test_arguments_that_do_not_go_together_are_refused(arguments, message):
 def test_each_learns_what_pays(name):
     # Not the transformer: here the reward reads what the next state does not hold, so the graph does not show it
     policy_kwargs = {"net_arch": [64, 64], "world_model_net_arch": [8, 8]}
-    arguments = {**SMALL, "gamma": 0.5, "batch_size": 64, "policy_kwargs": policy_kwargs}
+    arguments = {**KWARGS, "gamma": 0.5, "batch_size": 64, "policy_kwargs": policy_kwargs}
     model = CausalGDP("MlpPolicy", Aim(), **preset(name, **arguments))
     model.learn(700)
     observations = np.random.default_rng(1).uniform(-1.0, 1.0, (500, 2)).astype(np.float32)
@@ -132,14 +126,14 @@ def test_each_learns_what_pays(name):
 
 
 def test_the_targets_of_implicit_q_learning_ask_no_policy():
-    model = CausalGDP("MlpPolicy", "Pendulum-v1", **preset("edp_iql", **SMALL))
+    model = CausalGDP("MlpPolicy", "Pendulum-v1", **preset("edp_iql", **KWARGS))
     model.learn(250)
     data = model.replay_buffer.sample(32)
-    _, target = model._updates.td_target(data)
+    _, target = model._updates.bootstrap(data)
     with th.no_grad():
         for parameter in model.actor_target.parameters():
             parameter.add_(1.0)
-    assert th.equal(model._updates.td_target(data)[1], target)
+    assert th.equal(model._updates.bootstrap(data)[1], target)
     with th.no_grad():
         value = model.critic.value(data.next_observations)
     discounts = model.gamma if data.discounts is None else data.discounts
@@ -147,7 +141,7 @@ def test_the_targets_of_implicit_q_learning_ask_no_policy():
 
 
 def test_the_attention_preset_looks_along_the_graph_that_was_found():
-    model = CausalGDP("MlpPolicy", "Pendulum-v1", **preset("attention", **SMALL))
+    model = CausalGDP("MlpPolicy", "Pendulum-v1", **preset("attention", **KWARGS))
     assert bool((model.actor.denoiser.attention == 1.0).all())
     model.learn(400)
     assert not bool((model.actor.denoiser.attention == 1.0).all())
@@ -155,7 +149,7 @@ def test_the_attention_preset_looks_along_the_graph_that_was_found():
 
 
 def test_the_one_pass_policy_asks_the_denoiser_nothing_and_survives_saving(tmp_path):
-    model = CausalGDP("MlpPolicy", "Pendulum-v1", **preset("dtql", guided=True, **SMALL))
+    model = CausalGDP("MlpPolicy", "Pendulum-v1", **preset("dtql", guided=True, **KWARGS))
     model.learn(400)
     observations = np.random.default_rng(0).normal(size=(8, 3)).astype(np.float32)
     actions, _ = model.predict(observations, deterministic=True)
@@ -226,6 +220,6 @@ def test_distilling_needs_a_policy_that_denoises_and_transitions(teacher):
     with pytest.raises(ValueError, match="needs transitions, got none"):
         CausalGDP("MlpPolicy", Aim()).distil()
     with pytest.raises(ValueError, match="needs a policy that denoises"):
-        CausalGDP("MlpPolicy", Aim(), **preset("dtql", **SMALL)).distil()
+        CausalGDP("MlpPolicy", Aim(), **preset("dtql", **KWARGS)).distil()
     with pytest.raises(ValueError, match=r"gradient_steps must be an integer from 1 .*, got 0"):
         teacher.distil(gradient_steps=0)

@@ -7,6 +7,7 @@ import pytest
 import torch as th
 from goal_env import GoalEnv
 from gymnasium import spaces
+from small_models import small
 from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.callbacks import (
     BaseCallback,
@@ -23,15 +24,7 @@ from sb3_causalgdp import CausalGDP, CausalWorldModelCallback
 from sb3_causalgdp.causal.sources import open_source as open_causal_source
 from sb3_causalgdp.offline.sources import Source
 
-KWARGS = {
-    "learning_starts": 5,
-    "batch_size": 8,
-    "buffer_size": 1000,
-    "causal_refresh_freq": 10,
-    "seed": 0,
-    "device": "cpu",
-    "policy_kwargs": {"net_arch": [16], "world_model_net_arch": [16, 16]},
-}
+KWARGS = small(learning_starts=5, train_freq=1, causal_refresh_freq=10)
 N_ROWS = 400
 GOAL_KEYS = ("observation", "achieved_goal", "desired_goal")
 

@@ -6,6 +6,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
+from small_models import small
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 
@@ -16,13 +17,7 @@ from sb3_causalgdp.losses import denoising_loss
 from sb3_causalgdp.networks import q_values
 from sb3_causalgdp.offline.replay import deal_rows, rows_of
 
-KWARGS = {
-    "policy_kwargs": {"net_arch": [16, 16], "world_model_net_arch": [8, 8]},
-    "learning_starts": 210,
-    "causal_refresh_freq": 205,
-    "batch_size": 32,
-    "seed": 0,
-}
+KWARGS = small(learning_starts=210, causal_refresh_freq=205, batch_size=32, train_freq=1)
 
 
 AS_THEY_ARE = {"critic_normalization": None, "normalize_observations": False}
@@ -98,7 +93,7 @@ def test_target_networks_follow_at_every_gradient_step(steps_per_call, monkeypat
 def test_td_targets_up_to_an_update_of_the_actor_are_computed_at_once(n_updates, sizes, monkeypatch):
     model = trained_model(policy_delay=2)
     model._n_updates = n_updates
-    asked, given, td_target, update_critics = [], [], model._updates.td_target, model._updates.update_critics
+    asked, given, td_target, update_critics = [], [], model._updates.bootstrap, model._updates.update_critics
 
     def ask(data):
         asked.append((data, td_target(data)[1]))
@@ -108,7 +103,7 @@ def test_td_targets_up_to_an_update_of_the_actor_are_computed_at_once(n_updates,
         given.append((data, target.clone()))
         return update_critics(data, target, *args)
 
-    monkeypatch.setattr(model._updates, "td_target", ask)
+    monkeypatch.setattr(model._updates, "bootstrap", ask)
     monkeypatch.setattr(model._updates, "update_critics", give)
     model.train(gradient_steps=5, batch_size=32)
     assert [len(target) for _, target in asked] == [32 * size for size in sizes]

@@ -10,7 +10,7 @@ from sb3_causalgdp.zoo.hyperparameters import merged
 NET_ARCHS = {"small": [64, 64], "medium": [256, 256], "big": [400, 300]}
 WORLD_MODELS = {"small": [64, 64], "medium": [128, 128, 128], "big": [256, 256, 256, 256]}
 # The first two of these need no optional package
-DISCOVERY_METHODS = ["partial_r2", "notears"]
+SEARCHED_METHODS = ["partial_r2", "notears"]
 GUIDANCE_TARGETS = ["return", "reward", "none"]
 ACTOR_UPDATES = ["one_step", "chain"]
 
@@ -56,7 +56,7 @@ def sample_causalgdp_params(
     trial.suggest_int("causal_refresh_freq", 250, 8000, log=True)
     if not entry.get("causal_discovery_kwargs"):
         # Arguments in the YAML file are those of the method that it names
-        trial.suggest_categorical("causal_discovery", DISCOVERY_METHODS)
+        trial.suggest_categorical("causal_discovery", SEARCHED_METHODS)
     if entry.get("offline_dataset"):
         trial.suggest_float("offline_fraction", 0.0, 1.0)
     if additional_args.get("using_her_replay_buffer"):

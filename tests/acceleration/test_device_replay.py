@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
+from small_models import small
 from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
@@ -15,7 +16,7 @@ CPU = th.device("cpu")
 ACTIONS = spaces.Box(-1.0, 1.0, (2,))
 VECTORS = spaces.Box(-np.inf, np.inf, (3,), np.float64)
 DICTIONARIES = spaces.Dict({"image": spaces.Box(0, 255, (4, 4, 3), np.uint8), "vector": VECTORS})
-KWARGS = {"policy_kwargs": {"net_arch": [8], "world_model_net_arch": [8]}, "batch_size": 16, "seed": 0, "device": "cpu"}
+KWARGS = small(batch_size=16, train_freq=1)
 
 
 def make_buffer(space, n_envs, size=10):
@@ -108,7 +109,7 @@ def no_other_sampling(monkeypatch):
 def test_training_draws_from_the_copy_and_the_same_for_the_same_seed():
     weights = []
     for _ in range(2):
-        model = CausalGDP("MlpPolicy", "Pendulum-v1", buffer_size=150, learning_starts=100, **KWARGS)
+        model = CausalGDP("MlpPolicy", "Pendulum-v1", **{**KWARGS, "buffer_size": 150, "learning_starts": 100})
         model.learn(220)  # over the end of the buffer
         copy = model._updates.batches.on_device(model.replay_buffer)
         copy.copy_new_rows()
@@ -119,7 +120,7 @@ def test_training_draws_from_the_copy_and_the_same_for_the_same_seed():
 
 @pytest.mark.usefixtures("copies_on_a_cpu", "no_other_sampling")
 def test_offline_and_online_transitions_have_a_copy_each_and_none_is_saved(tmp_path):
-    model = CausalGDP("MlpPolicy", "Pendulum-v1", buffer_size=200, learning_starts=0, **KWARGS)
+    model = CausalGDP("MlpPolicy", "Pendulum-v1", **{**KWARGS, "buffer_size": 200, "learning_starts": 0})
     rng = np.random.default_rng(0)
     rows = {name: rng.standard_normal((50, 3)) for name in ("observations", "next_observations")}
     rows |= {"actions": rng.uniform(-2, 2, (50, 1)), "rewards": rng.standard_normal(50)}
@@ -137,5 +138,5 @@ def test_offline_and_online_transitions_have_a_copy_each_and_none_is_saved(tmp_p
 @pytest.mark.usefixtures("copies_on_a_cpu")
 def test_observations_that_are_normalised_anew_are_not_copied():
     env = VecNormalize(DummyVecEnv([lambda: gym.make("Pendulum-v1")]))
-    model = CausalGDP("MlpPolicy", env, learning_starts=20, **KWARGS).learn(30)
+    model = CausalGDP("MlpPolicy", env, **KWARGS).learn(30)
     assert model._updates.batches._on_device == {}

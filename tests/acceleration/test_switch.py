@@ -73,7 +73,7 @@ def test_switched_off_nothing_is_compiled_recorded_copied_or_covered(monkeypatch
     # Neither is looked at: on a CPU the second would be refused
     asking = CausalGDP("MlpPolicy", "Pendulum-v1", device="cpu", buffer_size=100, compile=True, cuda_graph=True)
     assert asking._updates.fast.graphs is None
-    assert asking._updates.td_target.__func__ is type(asking._updates).td_target
+    assert asking._updates.bootstrap.__func__ is type(asking._updates).bootstrap
 
 
 def is_on(value):

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
+from small_models import small
 from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.envs import BitFlippingEnv, FakeImageEnv
 from stable_baselines3.common.logger import Logger
@@ -23,8 +24,7 @@ from sb3_causalgdp.policies import CausalGDPPolicy
 
 PACKAGE = Path(sb3_causalgdp.__file__).parent
 DOCS = Path(__file__).parents[2] / "docs"
-KWARGS = {"learning_starts": 10, "batch_size": 8, "train_freq": 16, "causal_refresh_freq": 48, "buffer_size": 1_000, "seed": 0}
-SMALL = {**KWARGS, "policy_kwargs": {"net_arch": [16], "world_model_net_arch": [16]}}
+KWARGS = small(learning_starts=10, train_freq=16, causal_refresh_freq=48)
 
 
 def read(page):
@@ -136,7 +136,7 @@ def test_every_logged_key_has_a_row_and_every_row_a_key(monkeypatch):
     recorded = set()
     record = Logger.record
     monkeypatch.setattr(Logger, "record", lambda self, key, *args, **kw: recorded.add(key) or record(self, key, *args, **kw))
-    model = CausalGDP("MlpPolicy", "Pendulum-v1", **SMALL)
+    model = CausalGDP("MlpPolicy", "Pendulum-v1", **KWARGS)
     model.learn(64, callback=CausalWorldModelCallback(min_transitions=30))
     model.pretrain(1, log_interval=1)
     cells = re.findall(r"^\| (`\w+/\w+`.*?) \|", read("guide/callbacks.md"), re.MULTILINE)
@@ -203,12 +203,12 @@ def load_nan():
 
 
 def load_a_state_of_another_size():
-    other = CausalGDP("MlpPolicy", "Pendulum-v1", **KWARGS, policy_kwargs={"net_arch": [8]}).learn(32)
+    other = CausalGDP("MlpPolicy", "Pendulum-v1", **{**KWARGS, "policy_kwargs": {"net_arch": [8]}}).learn(32)
     make().set_parameters({"critic.optimizer": other.critic.optimizer.state_dict()}, exact_match=False)
 
 
 def make(env="Pendulum-v1", policy="MlpPolicy", **kwargs):
-    return CausalGDP(policy, env, **{**SMALL, **kwargs})
+    return CausalGDP(policy, env, **{**KWARGS, **kwargs})
 
 
 def preload_twice_scaled():
@@ -223,7 +223,7 @@ def preload_with_hindsight():
 
 def react_to_images():
     env = FakeImageEnv(screen_height=36, screen_width=36, n_channels=1, discrete=False, channel_first=True)
-    model = CausalGDP("CnnPolicy", env, **KWARGS, policy_kwargs={"features_extractor_kwargs": {"features_dim": 4}})
+    model = CausalGDP("CnnPolicy", env, **{**KWARGS, "policy_kwargs": {"features_extractor_kwargs": {"features_dim": 4}}})
     model.learn(32)
     observations = np.stack([env.observation_space.sample() for _ in range(2)])
     model.counterfactual((observations, np.zeros((1, *env.action_space.shape)), [0.0]), {"action[0]": 0.0}, follow_policy=True)

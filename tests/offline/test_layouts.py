@@ -2,13 +2,14 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.spaces import Box, Dict, Discrete
+from small_models import small
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
 from sb3_causalgdp import CausalGDP
 from sb3_causalgdp.offline.sources import ArraySource
 
-KWARGS = {"learning_starts": 5, "batch_size": 8, "buffer_size": 1000, "device": "cpu", "policy_kwargs": {"net_arch": [16]}}
+KWARGS = small(learning_starts=5)
 N_ROWS = 12
 
 

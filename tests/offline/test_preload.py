@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from goal_env import GOALS, GoalEnv
 from gymnasium import spaces
+from small_models import small
 from stable_baselines3 import SAC, HerReplayBuffer
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.env_util import make_vec_env
@@ -25,14 +26,7 @@ from minari.data_collector import EpisodeBuffer  # noqa: E402
 from minari.storage import remotes  # noqa: E402
 from minari.storage.remotes.cloud_storage import CloudStorage  # noqa: E402
 
-KWARGS = {
-    "learning_starts": 5,
-    "batch_size": 8,
-    "buffer_size": 1000,
-    "seed": 0,
-    "device": "cpu",
-    "policy_kwargs": {"net_arch": [16], "world_model_net_arch": [16, 16]},
-}
+KWARGS = small(learning_starts=5, train_freq=1, causal_refresh_freq=1_000)
 PENDULUM = gym.make("Pendulum-v1")
 OBSERVATIONS, ACTIONS = PENDULUM.observation_space, PENDULUM.action_space
 LENGTHS = (5, 3, 7)

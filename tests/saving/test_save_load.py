@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
+from small_models import SPREAD, small
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import configure
@@ -23,23 +24,7 @@ from torch import nn
 from sb3_causalgdp import CausalGDP, CausalWorldModelCallback
 from sb3_causalgdp.causal import CausalGraph, TransitionVariables
 
-KWARGS = {
-    "learning_starts": 50,
-    "batch_size": 16,
-    "train_freq": 8,
-    "gradient_steps": 2,
-    "buffer_size": 1000,
-    # Else all actions would lie on their bounds, and be the same for that reason
-    "learning_rate": 1e-2,
-    "eta": 0.01,
-    "denoising_weight": 1.0,
-    "n_action_candidates": 3,
-    "causal_refresh_freq": 100,
-    "causal_half_life": 400.0,
-    "seed": 0,
-    "device": "cpu",
-    "policy_kwargs": {"net_arch": [16], "world_model_net_arch": [16, 16]},
-}
+KWARGS = small(**SPREAD, learning_starts=50, batch_size=16, gradient_steps=2, causal_refresh_freq=100, causal_half_life=400.0)
 
 
 class RecordingCallback(CausalWorldModelCallback):

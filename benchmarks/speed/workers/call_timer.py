@@ -35,7 +35,7 @@ PARTS = (
         r"\._?sample(_batch|_transitions)?$(?<!Actor\.sample)(?<!samplers\.sample)|\._draw|concatenate_samples",
         "firm",
     ),
-    Part("TD target", r"td_target|bellman", "firm"),
+    Part("TD target", r"bootstrap|td_target", "firm"),
     Part("targets", r"polyak|update_averages$|_targets$|soft_update", "firm"),
     Part("denoising and guidance", r"denois\w*_loss|make_guidance|guidance_shift", "firm"),
     Part("Q term", r"Actor\.sample$|samplers\.sample|q_loss|q_term|\.q_values$", "firm"),
