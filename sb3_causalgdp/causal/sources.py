@@ -89,7 +89,8 @@ class RecordedRows(ChunkedRows):
     """
 
     def __init__(self, source: recorded.Source, max_rows: int | None = None) -> None:
-        observation_space, action_space = source.observation_space, source.action_space
+        observation_space: spaces.Space | None = source.observation_space
+        action_space: spaces.Space | None = source.action_space
         if observation_space is None or action_space is None:
             first = next(source.as_recorded(), None)
             if first is None:
