@@ -60,7 +60,8 @@ class BufferSource(Source):
         lack = f"{name} lacks {missing or ['timeouts']}: it was not written by this version of SB3"
         if missing:
             raise ValueError(lack)
-        check_attributes(buffer)
+        with errors_of(name, "is incomplete or damaged"):
+            check_attributes(buffer)
         if saves_memory:
             self.lack = (
                 f"{name} was made with optimize_memory_usage=True and does not hold the last observations of its episodes: "

@@ -286,9 +286,7 @@ def test_minari_datasets_that_are_damaged(minari, capsys):
         with h5py.File(Path(dataset.storage.data_path) / "main_data.hdf5", "r+") as file:
             del file["episode_1"][field]
         said = error_of(capsys, name, "--quiet")
-        assert (
-            f"{name}: episode 1 is incomplete" in said or f"{name} cannot be read, its file is incomplete or damaged" in said
-        )
+        assert name in said and ("incomplete or damaged" in said or "episode 1 is incomplete" in said)
         assert error_of(capsys, name, "--quiet", "--max-rows", "5").count("\n") == 0
 
 
