@@ -21,6 +21,7 @@ CONTENT, BLOCK, OFFLINE = "buffer", "block", "offline/"
 # Attributes that our algorithm gives a buffer while it is written
 ADDED = ("saved_after", "observation_layout", "reward_transform")
 MOST_ROWS = 100_000_000
+RECORDED_ROWS = 4096  # a batch of discovery, which copies nothing then
 COLUMNS = ("observations", "actions", "rewards", "dones")
 NUMBERS = ("pos", "full", "buffer_size", "n_envs", "optimize_memory_usage")
 ATTRIBUTES = (*COLUMNS, *NUMBERS, "observation_space", "action_space")
@@ -78,7 +79,7 @@ class BufferSource(Source):
     def as_recorded(self) -> Iterator[Chunk]:
         for buffer in self.buffers:
             positions = _positions(buffer)
-            n_positions = max(1, CHUNK_ROWS // buffer.n_envs)
+            n_positions = max(1, RECORDED_ROWS // buffer.n_envs)
             for first in range(0, len(positions), n_positions):
                 yield self._read(buffer, positions[first : first + n_positions])
 
@@ -106,10 +107,11 @@ class BufferSource(Source):
             return values[positions].reshape(len(positions) * values.shape[1], *values.shape[2:])
 
         saves_memory = buffer.optimize_memory_usage
-        after, following = (buffer.observations, positions + 1) if saves_memory else (buffer.next_observations, positions)
+        after = buffer.observations if saves_memory else buffer.next_observations
+        following = (positions + 1) % buffer.buffer_size if saves_memory else positions
         columns = {
             "observations": mapped(lambda values: at(positions, values), buffer.observations),
-            "next_observations": mapped(lambda values: at(following % buffer.buffer_size, values), after),
+            "next_observations": mapped(lambda values: at(following, values), after),
             "actions": at(positions, buffer.actions),
             "rewards": self._of_environment(at(positions, buffer.rewards)),
         }

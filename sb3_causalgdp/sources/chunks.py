@@ -10,7 +10,7 @@ import numpy.typing as npt
 from sb3_causalgdp.sources.tables import Table
 
 if TYPE_CHECKING:
-    from gymnasium import spaces
+    import gymnasium
 
 NEEDED = ("observations", "actions", "rewards", "next_observations")
 ENDS = ("terminations", "truncations")
@@ -56,7 +56,7 @@ class Source:
 
     has_scaled_actions = False
     """Whether actions are in [-1, 1] already, as SB3's replay buffers store them."""
-    layout: "spaces.Space | None" = None
+    layout: "gymnasium.spaces.Space | None" = None
     """What flat observations were flattened from, with its order of keys; None if it is not known."""
     state_names: tuple[str, ...] | None = None
     """Names of the components of an observation, where the source has them."""
@@ -71,8 +71,8 @@ class Source:
         self,
         name: str,
         n_transitions: int,
-        observation_space: "spaces.Space | None" = None,
-        action_space: "spaces.Space | None" = None,
+        observation_space: "gymnasium.spaces.Space | None" = None,
+        action_space: "gymnasium.spaces.Space | None" = None,
         environment: str | None = None,
     ) -> None:
         if action_space is not None:
