@@ -11,7 +11,7 @@ from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from sb3_causalgdp.checks import many_are_finite
 from sb3_causalgdp.offline.replay import arrays_of
-from sb3_causalgdp.saving.archives import errors_of, is_zip, named, opened, read_arrays, read_pickle, write_arrays
+from sb3_causalgdp.saving.archives import errors_of, named, write_arrays
 from sb3_causalgdp.saving.plain import FORMAT, SPACES, Known, NotPlainError, Writer
 from sb3_causalgdp.sources.buffers import (
     ADDED,
@@ -21,6 +21,7 @@ from sb3_causalgdp.sources.buffers import (
     OFFLINE,
     attributes_of,
     check_count,
+    content_of,
     n_stored_rows,
     no_buffer_error,
     split_arrays,
@@ -98,10 +99,10 @@ def read_buffer(path: Any, trusted: bool = False) -> ReplayBuffer:
     :return: The buffer, for no environment yet
     :raises ValueError: If it cannot be read
     """
-    with errors_of(path, "cannot be read as a replay buffer"), opened(path) as file:
-        if is_zip(file):
-            return _from_arrays(read_arrays(file), named(path))
-        buffer = read_pickle(file, trusted)
+    with errors_of(path, "cannot be read as a replay buffer"):
+        arrays, buffer = content_of(path, trusted)
+        if arrays is not None:
+            return _from_arrays(arrays, named(path))
         if not isinstance(buffer, ReplayBuffer):
             raise no_buffer_error(buffer, path)
         if not trusted:

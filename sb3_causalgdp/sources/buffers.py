@@ -242,16 +242,27 @@ def read_saved_buffer(path: Any, trusted: bool = False) -> Any:
     :return: What :class:`BufferSource` takes, with the rows that were stored
     :raises ValueError: If it cannot be read
     """
-    with errors_of(path, "cannot be read as a replay buffer"), opened(path) as file:
-        if is_zip(file):
-            own, preloaded = split_arrays(read_arrays(file))
-            buffer = _as_buffer(own)
-            buffer.offline_part = (_as_buffer(preloaded) if preloaded else None, [])
-            return buffer
-        buffer = read_pickle(file, trusted)
-        if not is_replay_buffer(buffer):
-            raise no_buffer_error(buffer, path)
+    with errors_of(path, "cannot be read as a replay buffer"):
+        arrays, pickled = content_of(path, trusted)
+        if arrays is None and not is_replay_buffer(pickled):
+            raise no_buffer_error(pickled, path)
+        if arrays is None:
+            return pickled
+        own, preloaded = split_arrays(arrays)
+        buffer = _as_buffer(own)
+        buffer.offline_part = (_as_buffer(preloaded) if preloaded else None, [])
         return buffer
+
+
+def content_of(path: Any, trusted: bool = False) -> tuple[dict[str, np.ndarray] | None, Any]:
+    """
+    :param path: Path or file-like object of a saved replay buffer
+    :param trusted: Whether a pickle may hold more than what SB3's own are made of, which could run code
+    :return: Its arrays by name, or None and what was pickled
+    :raises ValueError: If it is neither
+    """
+    with opened(path) as file:
+        return (read_arrays(file), None) if is_zip(file) else (None, read_pickle(file, trusted))
 
 
 def no_buffer_error(content: Any, path: Any) -> ValueError:

@@ -14,7 +14,7 @@ from stable_baselines3.common.save_util import save_to_pkl
 from sb3_causalgdp import CausalGDP
 from sb3_causalgdp.causal.sources import RecordedRows, ReplayBufferSource, SourceError
 from sb3_causalgdp.causal.sources import open_source as open_rows
-from sb3_causalgdp.offline.saved_buffers import write_buffer
+from sb3_causalgdp.offline.saved_buffers import read_buffer, write_buffer
 from sb3_causalgdp.offline.sources import open_source as open_for_training
 from sb3_causalgdp.sources.chunks import Chunk, Source
 from sb3_causalgdp.sources.recorded import ArraySource, BufferSource, MinariSource, TableSource, open_source
@@ -228,10 +228,12 @@ def test_attributes_of_a_buffer_that_do_not_fit_each_other(name, value, message,
 def test_files_of_something_else_are_named(tmp_path):
     save_to_pkl(tmp_path / "list.pkl", [1, 2, 3])
     (tmp_path / "notes.txt").write_text("something else")
-    for read in (open_source, open_rows, open_for_training):
+    reads = (open_source, open_rows, open_for_training)
+    for read in (*reads, read_buffer):
         with pytest.raises(ValueError, match=r"list\.pkl holds no replay buffer but a list: save one with model\."):
             read(tmp_path / "list.pkl")
         with pytest.raises(ValueError, match=r"notes\.txt cannot be read as a replay buffer: "):
             read(tmp_path / "notes.txt")
+    for read in reads:
         with pytest.raises(TypeError, match=r"A source is the id of a Minari dataset, .* got int"):
             read(3)
