@@ -25,8 +25,8 @@ from sb3_causalgdp.causal.endings import with_endings
 from sb3_causalgdp.causal.world_model import MaskedWorldModel
 from sb3_causalgdp.names import found_names
 from sb3_causalgdp.offline.algorithm import OfflineToOnlineAlgorithm
-from sb3_causalgdp.offline.rewards import RewardTransform
 from sb3_causalgdp.policies import CausalGDPPolicy, DiffusionActor
+from sb3_causalgdp.sources.rewards import RewardTransform
 from sb3_causalgdp.updates import Updates
 
 SelfAlgorithm = TypeVar("SelfAlgorithm", bound="DiscoveringAlgorithm")

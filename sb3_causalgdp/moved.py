@@ -31,7 +31,11 @@ _NEW_NAMES = {
 }
 MOVED = {f"{__package__}.{old}": f"{__package__}.{new}" for old, new in _NEW_NAMES.items()}
 """New full names of modules by their old ones."""
-_CALLBACKS = (f"{__package__}.callbacks", "CausalWorldModelCallback")
+# Modules that are still there, from which a class went elsewhere
+_MOVED_CLASSES = {
+    (f"{__package__}.callbacks", "CausalWorldModelCallback"): f"{__package__}.callbacks.world_model",
+    (f"{__package__}.offline.rewards", "RewardTransform"): f"{__package__}.sources.rewards",
+}
 
 
 def current_module(module: str, name: str) -> str:
@@ -40,7 +44,7 @@ def current_module(module: str, name: str) -> str:
     :param name: What is in it
     :return: Full name of the module where that is now
     """
-    return f"{module}.world_model" if (module, name) == _CALLBACKS else MOVED.get(module, module)
+    return _MOVED_CLASSES.get((module, name)) or MOVED.get(module, module)
 
 
 class _OldNames(MetaPathFinder):

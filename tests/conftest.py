@@ -16,3 +16,10 @@ def hostile(tmp_path):
     mark = tmp_path / "mark"
     yield Hostile(mark)
     assert not mark.exists()
+
+
+@pytest.fixture
+def minari(tmp_path, monkeypatch):
+    """With an empty folder of datasets."""
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "datasets"))
+    return pytest.importorskip("minari")

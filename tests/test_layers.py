@@ -57,6 +57,7 @@ WITHOUT_SB3 = {
     "hints",
     "losses",
     "moved",
+    "sources",
     "stress",
     "acceleration.gradients",
     "acceleration.products",

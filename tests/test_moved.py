@@ -1,17 +1,29 @@
 import importlib
 import subprocess
 import sys
+import zipfile
 from pathlib import Path
 
 import numpy as np
 import pytest
+from small_models import SMALL
 
 from sb3_causalgdp import CausalGDP
 from sb3_causalgdp.moved import MOVED
+from sb3_causalgdp.sources.rewards import RewardTransform
 
 DATA = Path(__file__).parent / "data"
 # Of the version in which both files were written, for this observation
 OBSERVATION, ACTION = np.array([[0.5, 0.5, 1.0]], dtype=np.float32), 1.1722972
+
+ARRAYS = {
+    "observations": np.zeros((15, 3)),
+    "actions": np.zeros((15, 1)),
+    "rewards": np.arange(15.0),
+    "next_observations": np.zeros((15, 3)),
+    "terminations": np.arange(15) % 5 == 4,
+    "truncations": np.zeros(15, bool),
+}
 
 
 @pytest.mark.parametrize("old", MOVED)
@@ -22,6 +34,25 @@ def test_old_names_of_modules_are_the_new_modules_and_say_so(old, monkeypatch):
         module = importlib.util.find_spec(old).loader.create_module(importlib.util.find_spec(old))
     assert module is importlib.import_module(MOVED[old])
     assert module.__spec__.name == MOVED[old]
+
+
+def test_classes_that_went_elsewhere_are_found_under_their_old_names(tmp_path):
+    model = CausalGDP("MlpPolicy", "Pendulum-v1", **SMALL, reward_transform="antmaze").preload(ARRAYS)
+    model.save(tmp_path / "new.zip")
+    with zipfile.ZipFile(tmp_path / "new.zip") as new, zipfile.ZipFile(tmp_path / "old.zip", "w") as old:
+        for name in new.namelist():
+            old.writestr(name, new.read(name).replace(b"sb3_causalgdp.sources.rewards.", b"sb3_causalgdp.offline.rewards."))
+        assert b"sb3_causalgdp.sources.rewards.RewardTransform" in new.read("plain.json")
+    with zipfile.ZipFile(tmp_path / "old.zip") as old:
+        assert b"sb3_causalgdp.offline.rewards.RewardTransform" in old.read("plain.json")
+    assert CausalGDP.load(tmp_path / "old.zip", device="cpu")._reward_transform == RewardTransform(4.0, -2.0)
+
+
+@pytest.mark.parametrize("name", ["Source", "Chunk", "MinariSource", "BufferSource", "ArraySource", "TableSource"])
+def test_sources_can_be_imported_from_where_they_were(name):
+    assert getattr(importlib.import_module("sb3_causalgdp.offline.sources"), name).__module__.startswith(
+        "sb3_causalgdp.sources."
+    )
 
 
 def test_a_model_that_was_saved_under_old_names_loads():

@@ -17,7 +17,7 @@ from sb3_causalgdp.losses import denoising_loss
 from sb3_causalgdp.networks import q_values
 from sb3_causalgdp.offline.replay import deal_rows, rows_of
 
-KWARGS = small(learning_starts=210, causal_refresh_freq=205, batch_size=32, train_freq=1)
+KWARGS = small({"net_arch": [16, 16]}, learning_starts=210, causal_refresh_freq=205, batch_size=32, train_freq=1)
 
 
 AS_THEY_ARE = {"critic_normalization": None, "normalize_observations": False}

@@ -31,7 +31,7 @@ from typing import Any
 SECONDS = 30.0
 KINDS = (
     *("model.zip", "parameters.zip", "checkpoint.zip", "policy.pt", "buffer.npz", "buffer.pkl", "her.npz", "arrays.npz"),
-    *("minari", "graph.json"),
+    *("preloaded.npz", "preloaded.pkl", "minari", "graph.json"),
 )
 WILD: tuple[Any, ...] = (
     *(None, True, False, [], {}, "", "x", "nan", "../../etc/passwd", "os:system", -1, 0, 1, 2, 3.5, 1e9, -1e9, 1e308),
@@ -64,6 +64,8 @@ def write_files(folder: Path) -> None:
     model.policy.save(str(folder / "policy.pt"))
     model.save_replay_buffer(folder / "buffer.npz")
     model.save_replay_buffer(folder / "buffer.pkl")
+    for suffix in (".npz", ".pkl"):
+        shutil.copyfile(folder / f"buffer{suffix}", folder / f"preloaded{suffix}")
     model.causal_graph().save(folder / "graph.json")
     generator, no = np.random.default_rng(0), np.zeros(50, bool)
     observations, following = generator.normal(size=(2, 50, 3)).astype(np.float32)
@@ -253,6 +255,8 @@ def read(path: Path, kind: str) -> Any:
         model.preload("strange/data-v0", download=False)
     else:
         model.preload(path)
+    if kind.startswith("preloaded"):
+        assert sum(map(len, open_source(path).batches())) > 0
     return [model.replay_buffer.observations[:20], model.replay_buffer.rewards[:20], model.replay_buffer.actions[:20]]
 
 

@@ -1,12 +1,16 @@
 """Recorded transitions that discovery reads in batches of rows, and those of tables."""
 
+import math
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from typing import Any
 
 import numpy as np
 
 from sb3_causalgdp.causal.variables import TransitionVariables
 from sb3_causalgdp.saving.archives import one_line
+from sb3_causalgdp.sources.chunks import Source
+from sb3_causalgdp.sources.chunks import TableSource as ChunksOfTable
 from sb3_causalgdp.sources.tables import Table
 
 BATCH_ROWS = 4096
@@ -41,7 +45,7 @@ class TransitionSource(ABC):
         """
         waiting: list[np.ndarray] = []
         n_waiting = 0
-        for part in self._chosen_rows(batch_rows):
+        for part in self._chosen_rows():
             waiting.append(part)
             n_waiting += len(part)
             if n_waiting >= batch_rows:
@@ -52,36 +56,66 @@ class TransitionSource(ABC):
         if n_waiting > 0:
             yield np.concatenate(waiting)
 
-    def _chosen_rows(self, n_rows: int) -> Iterator[np.ndarray]:
+    def _chosen_rows(self) -> Iterator[np.ndarray]:
         if self.n_rows == self.n_stored:
-            yield from self._read_parts(n_rows)
+            yield from self._read_parts()
             return
         chosen = np.linspace(0, self.n_stored - 1, self.n_rows).astype(np.int64)
         first = 0
-        for part in self._read_parts(n_rows):
+        for part in self._read_parts():
             lower, upper = np.searchsorted(chosen, [first, first + len(part)])
             yield part[chosen[lower:upper] - first]
             first += len(part)
 
-    def _read_parts(self, n_rows: int) -> Iterator[np.ndarray]:
+    def _read_parts(self) -> Iterator[np.ndarray]:
         n_read = 0
         try:
-            for part in self._parts(n_rows):
+            for part in self._parts():
                 n_read += len(part)
                 yield part
         except SourceError:
             raise
         except Exception as error:  # of the file's library, or of parts that do not fit together
-            raise SourceError(f"{self.name} is incomplete or damaged behind transition {n_read}: {one_line(error)}") from error
+            text = one_line(error)
+            if not text.startswith(self.name):
+                text = f"{self.name} is incomplete or damaged behind transition {n_read}: {text}"
+            raise SourceError(text) from error
         if n_read != self.n_stored:
             raise SourceError(f"{self.name} is incomplete: it announces {self.n_stored} transitions and holds {n_read}")
 
     @abstractmethod
-    def _parts(self, n_rows: int) -> Iterator[np.ndarray]:
-        """All rows in their order, in parts of any length, ``n_rows`` at most where there is a choice."""
+    def _parts(self) -> Iterator[np.ndarray]:
+        """All rows in their order, in parts of any length."""
 
 
-class TableSource(TransitionSource):
+class ChunkedRows(TransitionSource):
+    """
+    The rows of a source of chunks.
+
+    :param source: The source
+    :param variables: Names and order of the variables
+    :param flat: Makes rows of numbers, shape (N, n), of N observations as the source has them
+    :param max_rows: Read at most this many transitions, spread evenly over all; None reads all
+    """
+
+    def __init__(
+        self,
+        source: Source,
+        variables: TransitionVariables,
+        flat: Callable[[Any], np.ndarray],
+        max_rows: int | None = None,
+    ) -> None:
+        self.source = source
+        self.flat = flat
+        super().__init__(source.name, variables, source.n_transitions, max_rows)
+
+    def _parts(self) -> Iterator[np.ndarray]:
+        for chunk in self.source.as_recorded():
+            states, next_states = self.flat(chunk.observations), self.flat(chunk.next_observations)
+            yield self.variables.stack(states, as_rows(chunk.actions), next_states, chunk.rewards)
+
+
+class TableSource(ChunkedRows):
     """
     The transitions of a table.
 
@@ -92,10 +126,12 @@ class TableSource(TransitionSource):
     def __init__(self, table: Table, max_rows: int | None = None) -> None:
         self.table = table
         variables = TransitionVariables(table.state_names, table.action_names)
-        super().__init__(table.name, variables, len(table), max_rows)
+        super().__init__(ChunksOfTable(table, np.float64), variables, as_rows, max_rows)
 
-    def _parts(self, n_rows: int) -> Iterator[np.ndarray]:
-        table = self.table
-        columns = (table.observations, table.actions, table.next_observations, table.rewards)
-        for first in range(0, self.n_stored, n_rows):
-            yield self.variables.stack(*(values[first : first + n_rows] for values in columns))
+
+def as_rows(values: np.ndarray) -> np.ndarray:
+    """
+    :param values: Shape (N, ...)
+    :return: the same numbers, shape (N, n)
+    """
+    return values.reshape(len(values), math.prod(values.shape[1:]))

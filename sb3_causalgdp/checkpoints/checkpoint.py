@@ -28,11 +28,11 @@ from sb3_causalgdp.checkpoints.pickles import classes_in, from_bytes, to_bytes
 from sb3_causalgdp.checkpoints.store import Checkpoint, open_checkpoint, run_of, write_checkpoint
 from sb3_causalgdp.checkpoints.transitions import FOLDER, Log, rest_of, set_rest
 from sb3_causalgdp.files import errors_about, replaced_when_done, temporary_folder
-from sb3_causalgdp.offline.rewards import RewardTransform
 from sb3_causalgdp.offline.saved_buffers import BUFFERS, check_columns
 from sb3_causalgdp.saving.archives import errors_of
 from sb3_causalgdp.saving.models import check_limits
 from sb3_causalgdp.saving.numpy_pickles import check_random_state
+from sb3_causalgdp.sources.rewards import RewardTransform
 
 SelfAlgorithm = TypeVar("SelfAlgorithm", bound=OffPolicyAlgorithm)
 

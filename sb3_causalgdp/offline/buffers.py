@@ -18,10 +18,12 @@ from sb3_causalgdp.offline.preload import (
     positions_needed,
     preload_buffer,
 )
-from sb3_causalgdp.offline.rewards import RewardTransform, SavedRewards
-from sb3_causalgdp.offline.saved_buffers import SUFFIXES, can_be_arrays, read_buffer, write_buffer
-from sb3_causalgdp.offline.sources import Source, open_source
+from sb3_causalgdp.offline.saved_buffers import can_be_arrays, read_buffer, write_buffer
+from sb3_causalgdp.offline.sources import open_source
 from sb3_causalgdp.saving.archives import errors_of, existing
+from sb3_causalgdp.sources.buffers import SUFFIXES
+from sb3_causalgdp.sources.chunks import Source
+from sb3_causalgdp.sources.rewards import RewardTransform, SavedRewards
 
 SelfAlgorithm = TypeVar("SelfAlgorithm", bound="BufferedAlgorithm")
 

@@ -9,7 +9,8 @@ from stable_baselines3.common.preprocessing import get_obs_shape
 
 from sb3_causalgdp.checks import many_are_finite
 from sb3_causalgdp.offline.preload import preload_buffer
-from sb3_causalgdp.offline.sources import BufferSource, as_flags
+from sb3_causalgdp.sources.buffers import BufferSource
+from sb3_causalgdp.sources.chunks import as_flags
 
 
 def check_loaded_buffer(

@@ -13,9 +13,11 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from sb3_causalgdp.hints import how_to_install
-from sb3_causalgdp.offline.observations import ObservationMap, observation_map, shape_of_arrays
-from sb3_causalgdp.offline.rewards import RewardTransform, check_reward_transform, make_reward_transform
-from sb3_causalgdp.offline.sources import Chunk, Source
+from sb3_causalgdp.offline.observations import ObservationMap, observation_map
+from sb3_causalgdp.offline.rewards import check_reward_transform, make_reward_transform
+from sb3_causalgdp.sources.chunks import Chunk, Source
+from sb3_causalgdp.sources.rewards import RewardTransform
+from sb3_causalgdp.sources.spaces import shape_of_arrays
 
 ACTION_TOLERANCE = 1e-5
 UPDATE_ROWS = 10_000
@@ -169,6 +171,7 @@ class _Writer:
         assert self.map is not None
         observations, next_observations = self._mapped(chunk.observations), self._mapped(chunk.next_observations)
         actions = self._scaled(chunk)
+        assert chunk.terminations is not None and chunk.truncations is not None  # as offline.sources.open_source has seen
         dones = chunk.terminations | chunk.truncations
         if self.needs_order and not self.source.is_in_order:
             self._check_order(observations, next_observations, dones)

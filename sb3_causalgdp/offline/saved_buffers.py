@@ -1,31 +1,35 @@
 """Replay buffers of SB3 in files: arrays that need no pickle, and what SB3 pickles."""
 
 import json
-import zipfile
 from collections.abc import Iterator, Mapping
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-from gymnasium import spaces
 from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.her.goal_selection_strategy import GoalSelectionStrategy
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from sb3_causalgdp.checks import many_are_finite
 from sb3_causalgdp.offline.replay import arrays_of
-from sb3_causalgdp.offline.rewards import SavedRewards
-from sb3_causalgdp.saving.archives import errors_of, is_zip, named, opened, read_arrays, read_pickle, write_arrays
-from sb3_causalgdp.saving.plain import FORMAT, SPACES, Known, NotPlainError, Writer, decoded, read_json
+from sb3_causalgdp.saving.archives import errors_of, named, write_arrays
+from sb3_causalgdp.saving.plain import FORMAT, SPACES, Known, NotPlainError, Writer
+from sb3_causalgdp.sources.buffers import (
+    ADDED,
+    BLOCK,
+    CONTENT,
+    MOST_ROWS,
+    OFFLINE,
+    attributes_of,
+    check_count,
+    content_of,
+    n_stored_rows,
+    no_buffer_error,
+    split_arrays,
+)
 
-SUFFIXES = (".npz", ".pkl")
 BUFFERS = (ReplayBuffer, DictReplayBuffer, NStepReplayBuffer, HerReplayBuffer)
 KNOWN = Known([*SPACES, GoalSelectionStrategy], BUFFERS)
-CONTENT, BLOCK, OFFLINE = "buffer", "block", "offline/"
-# Attributes that our algorithm gives a buffer while it is written
-ADDED = ("saved_after", "observation_layout", "reward_transform")
 NOT_WRITTEN = ("env", "device", "offline_part", "infos")
-MOST_ROWS = 100_000_000
 MOST_GOALS = 1_000
 
 
@@ -58,7 +62,7 @@ def write_buffer(buffer: ReplayBuffer, file: Any) -> None:
 def _arrays_of(buffer: ReplayBuffer, more: Mapping[str, Any]) -> dict[str, Any]:
     if not can_be_arrays(buffer):
         raise ValueError(f"{type(buffer).__name__} with what it holds needs a pickle: give the file the suffix .pkl")
-    n_rows = _n_rows(buffer)
+    n_rows = n_stored_rows(buffer)
     columns = dict(_columns(buffer))
     of_columns = {name.partition("/")[0] for name in columns}
     writer = Writer(KNOWN)
@@ -76,11 +80,6 @@ def _arrays_of(buffer: ReplayBuffer, more: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def _n_rows(buffer: ReplayBuffer) -> int:
-    # The memory efficient buffer keeps the newest next observation at the position of the next row
-    return buffer.buffer_size if buffer.full else min(buffer.pos + int(buffer.optimize_memory_usage), buffer.buffer_size)
-
-
 def _columns(buffer: ReplayBuffer) -> Iterator[tuple[str, np.ndarray]]:
     """By name, those of dictionaries with their key: ``(positions, n_envs, ...)``."""
     for name, column in arrays_of(buffer):
@@ -89,15 +88,6 @@ def _columns(buffer: ReplayBuffer) -> Iterator[tuple[str, np.ndarray]]:
 
 
 # Reading ----------------------------------------------------------------------------------------------------------------
-
-
-def is_buffer(path: Path) -> bool:
-    """
-    :param path: A file
-    :return: Whether it is what :func:`write_buffer` wrote
-    """
-    with errors_of(path):
-        return zipfile.is_zipfile(path) and f"{CONTENT}.npy" in zipfile.ZipFile(path).namelist()
 
 
 def read_buffer(path: Any, trusted: bool = False) -> ReplayBuffer:
@@ -109,12 +99,12 @@ def read_buffer(path: Any, trusted: bool = False) -> ReplayBuffer:
     :return: The buffer, for no environment yet
     :raises ValueError: If it cannot be read
     """
-    with errors_of(path, "cannot be read as a replay buffer"), opened(path) as file:
-        if is_zip(file):
-            return _from_arrays(read_arrays(file), named(path))
-        buffer = read_pickle(file, trusted)
+    with errors_of(path, "cannot be read as a replay buffer"):
+        arrays, buffer = content_of(path, trusted)
+        if arrays is not None:
+            return _from_arrays(arrays, named(path))
         if not isinstance(buffer, ReplayBuffer):
-            raise ValueError(f"{named(path)} holds no replay buffer of SB3 but a {type(buffer).__name__}")
+            raise no_buffer_error(buffer, path)
         if not trusted:
             for one in (buffer, getattr(buffer, "offline_part", (None,))[0]):
                 if one is not None:
@@ -123,9 +113,8 @@ def read_buffer(path: Any, trusted: bool = False) -> ReplayBuffer:
 
 
 def _from_arrays(arrays: dict[str, np.ndarray], name_of_buffer: str) -> ReplayBuffer:
-    own = {name: values for name, values in arrays.items() if not name.startswith(OFFLINE)}
+    own, parts = split_arrays(arrays)
     buffer, content = _one_buffer(own, name_of_buffer)
-    parts = {name.removeprefix(OFFLINE): values for name, values in arrays.items() if name.startswith(OFFLINE)}
     offline = buffer if content.get("is_offline") is True else _one_buffer(parts, name_of_buffer)[0] if parts else None
     marks = content.get("marks")
     if not isinstance(marks, list) or not all(isinstance(mark, str) for mark in marks):
@@ -135,17 +124,9 @@ def _from_arrays(arrays: dict[str, np.ndarray], name_of_buffer: str) -> ReplayBu
 
 
 def _one_buffer(arrays: dict[str, np.ndarray], name_of_buffer: str) -> tuple[ReplayBuffer, dict[str, Any]]:
-    if CONTENT not in arrays or BLOCK not in arrays:
-        raise ValueError("it says of no replay buffer what it is")
-    content = decoded(read_json(arrays.pop(CONTENT).tobytes()), arrays.pop(BLOCK).tobytes(), KNOWN)
+    content = attributes_of(arrays, KNOWN)
     buffer = _empty(content)
     names = [name for name in (*vars(buffer), *ADDED) if name in content]
-    if type(content.get("saved_after", 0)) is not int:
-        raise ValueError(f"saved_after must be a number of steps, got {str(content['saved_after'])[:80]}")
-    if not isinstance(content.get("observation_layout"), spaces.Space | None):
-        raise ValueError(f"observation_layout must be a space, got {str(content['observation_layout'])[:80]}")
-    if "reward_transform" in content:
-        SavedRewards.from_plain(content["reward_transform"])
     vars(buffer).update({name: content[name] for name in names})
     _fill(buffer, arrays)
     check_columns(buffer, name_of_buffer)
@@ -157,8 +138,7 @@ def _empty(content: Mapping[str, Any]) -> ReplayBuffer:
     if cls not in BUFFERS:
         raise ValueError(f"it is no replay buffer of SB3, but {cls!r}")
     for name, value in {"n_envs": n_envs, "buffer_size": size}.items():
-        if type(value) is not int or not 1 <= value <= MOST_ROWS:
-            raise ValueError(f"{name} must be an integer from 1 to {MOST_ROWS:,}, got {value!r}")
+        check_count(value, name, 1, MOST_ROWS)
     assert isinstance(n_envs, int) and isinstance(size, int)
     saves_memory = content.get("optimize_memory_usage") is True
     common: dict[str, Any] = {
@@ -185,7 +165,7 @@ def _empty_her(size: int, common: Mapping[str, Any]) -> HerReplayBuffer:
 
 
 def _fill(buffer: ReplayBuffer, arrays: dict[str, np.ndarray]) -> None:
-    n_rows = _n_rows(buffer)
+    n_rows = n_stored_rows(buffer)
     columns = dict(_columns(buffer))
     if columns.keys() != arrays.keys():
         raise ValueError(f"it must hold the arrays {sorted(columns)}, got {sorted(arrays)}")
@@ -230,13 +210,13 @@ def check_columns(buffer: ReplayBuffer, name_of_buffer: str) -> None:
             raise ValueError(f"its {name} have the shape {shape}, and {wanted} is needed, of {column.dtype}, got {dtype}")
     if not 0 <= buffer.pos < buffer.buffer_size:
         raise ValueError(f"its position is {buffer.pos}, and its size {buffer.buffer_size}")
-    _check_finite(columns, _n_rows(buffer), name_of_buffer)
+    _check_finite(columns, n_stored_rows(buffer), name_of_buffer)
     _check_ranges(buffer, columns)
 
 
 def _check_ranges(buffer: Any, columns: Mapping[str, np.ndarray]) -> None:
     """What rows and numbers of rows are computed from."""
-    size, n_rows = buffer.buffer_size, _n_rows(buffer)
+    size, n_rows = buffer.buffer_size, n_stored_rows(buffer)
     for name, most in {"dones": 1, "timeouts": 1, "ep_start": size - 1, "ep_length": size}.items():
         rows = columns[name][:n_rows] if name in columns else np.zeros(0)
         if rows.size > 0 and not 0 <= rows.min() <= rows.max() <= most:

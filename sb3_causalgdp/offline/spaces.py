@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
-from sb3_causalgdp.offline.sources import ArraySource, Source
+from sb3_causalgdp.sources.chunks import ArraySource, Source
 
 
 def spaces_of(

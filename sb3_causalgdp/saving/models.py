@@ -26,10 +26,10 @@ from sb3_causalgdp.causal.statistics.grouped import GroupedStatistics
 from sb3_causalgdp.causal.statistics.moments import Moments, Spread, StreamingMoments
 from sb3_causalgdp.causal.statistics.recent_rows import RecentRows
 from sb3_causalgdp.causal.variables import TransitionVariables
-from sb3_causalgdp.offline.rewards import RewardTransform
 from sb3_causalgdp.offline.saved_buffers import BUFFERS
 from sb3_causalgdp.saving.archives import TRUST, check_sums, checked_entries, errors_of, size_of
 from sb3_causalgdp.saving.plain import FORMAT, SPACES, Known, NotPlainError, Writer, decoded, read_json
+from sb3_causalgdp.sources.rewards import RewardTransform
 
 CONTENT, BLOCK = "plain.json", "plain.bin"
 # What SB3's own load can do without: it is in the plain part alone

@@ -1,1 +1,1 @@
-"""Recorded transitions as they lie in files and data frames, read once for discovery and for offline training."""
+"""Recorded transitions as they lie in files, buffers and data frames, read once for discovery and for offline training."""

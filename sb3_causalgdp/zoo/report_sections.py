@@ -20,8 +20,9 @@ from sb3_causalgdp.causal.description import count_of_edges
 from sb3_causalgdp.causal.edges import GraphDiff
 from sb3_causalgdp.causal.plots import plot_causal_graph, plot_history
 from sb3_causalgdp.causal.relevance import ASSUMPTION
-from sb3_causalgdp.offline.saved_buffers import SUFFIXES, read_buffer
+from sb3_causalgdp.offline.saved_buffers import read_buffer
 from sb3_causalgdp.saving.archives import existing
+from sb3_causalgdp.sources.buffers import SUFFIXES
 from sb3_causalgdp.zoo.hyperparameters import constructor_arguments
 from sb3_causalgdp.zoo.run_folder import Evaluations, RunFolder, saved_attributes, saved_versions
 from sb3_causalgdp.zoo.versions import installed_versions

@@ -17,8 +17,6 @@ from stable_baselines3.common.save_util import save_to_pkl
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_causalgdp import CausalGDP, CausalWorldModelCallback
-from sb3_causalgdp.offline.observations import flatten_batch
-from sb3_causalgdp.offline.sources import MinariSource
 
 minari = pytest.importorskip("minari")
 pytest.importorskip("h5py")
@@ -179,26 +177,6 @@ def test_float64_dictionaries_keep_their_type_and_keys(make_dataset):
         assert buffer.observations[key].dtype == np.float64
         np.testing.assert_array_equal(buffer.observations[key][:6, 0], given[0]["observations"][key][:-1])
         np.testing.assert_array_equal(buffer.next_observations[key][:6, 0], given[0]["observations"][key][1:])
-
-
-NESTED = spaces.Dict(
-    {
-        "observation": spaces.Box(-9.0, 9.0, (3,), np.float64),
-        "goal": spaces.Dict({"kettle": spaces.Box(-9.0, 9.0, (2,), np.float64), "burner": spaces.Discrete(3, start=1)}),
-        "pair": spaces.Tuple((spaces.MultiDiscrete([2, 3]), spaces.MultiBinary(2))),
-    }
-)
-
-
-def test_batches_are_flattened_as_gymnasium_flattens_one():
-    NESTED.seed(0)
-    samples = [NESTED.sample() for _ in range(4)]
-    batch = {
-        "observation": np.stack([one["observation"] for one in samples]),
-        "goal": {key: np.stack([one["goal"][key] for one in samples]) for key in ("kettle", "burner")},
-        "pair": tuple(np.stack([one["pair"][part] for one in samples]) for part in (0, 1)),
-    }
-    np.testing.assert_array_equal(flatten_batch(NESTED, batch), np.stack([spaces.flatten(NESTED, one) for one in samples]))
 
 
 def test_flattening_follows_the_environments_wrappers(make_dataset):
@@ -606,8 +584,3 @@ def test_an_episode_without_an_end_was_cut(make_dataset, episodes):
     episodes[0]["truncations"][:] = False
     buffer = make().preload(make_dataset(episodes)).replay_buffer
     assert buffer.dones[4, 0] == buffer.timeouts[4, 0] == 1.0
-
-
-def test_a_source_can_be_read_twice(dataset):
-    source = MinariSource(minari.load_dataset(dataset))
-    assert [len(chunk) for chunk in source.chunks()] == [len(chunk) for chunk in source.chunks()] == list(LENGTHS)
