@@ -89,7 +89,7 @@ class Updates:
     RUNNING_WEIGHT = 0.01
     REWARD_QUANTILE = 0.99
     N_BACKUP_ACTIONS = 10
-    COMPILED = ("td_target", "critic_gradients", "world_model_gradients", "actor_gradients")
+    COMPILED = ("bootstrap", "critic_gradients", "world_model_gradients", "actor_gradients")
 
     def __init__(self, model: Model) -> None:
         policy = model.policy
