@@ -1,0 +1,89 @@
+"""The page of a watched folder, for Bokeh's server: what each browser that opens it shows, and how that is renewed."""
+
+import asyncio
+
+import jinja2
+from bokeh.document import Document
+from bokeh.layouts import column
+from bokeh.models import Div, Select, Slider
+
+from sb3_causalgdp.zoo.pages import style
+from sb3_causalgdp.zoo.watch_folder import View, WatchedFolder
+
+TITLE = "CausalGDP in training"
+ABOVE_GRAPH = ("summary", "learning-curve", "rollout")
+BELOW_GRAPH = ("causal-graph", "history-of-the-graph", "effects-of-the-actions", "guidance-along-the-denoising-chain")
+# A page must not load anything from elsewhere, whatever stands on it
+POLICY = "default-src 'self'; script-src 'self' 'unsafe-inline' 'unsafe-eval'; style-src 'self' 'unsafe-inline'; img-src 'self' data:"
+TEMPLATE = """{% extends base %}
+{% block preamble %}
+<meta http-equiv="Content-Security-Policy" content="{{ policy }}">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<meta name="color-scheme" content="light">
+<style>{{ page_style }}</style>
+{% endblock %}
+{% block contents %}
+<h1>{{ title }}</h1>
+{{ super() }}
+{% endblock %}
+"""
+
+
+class WatchPage:
+    """
+    A page in one browser.
+
+    :param document: Bokeh's document of the page
+    :param watched: What it shows
+    :param refresh: Seconds between looks
+    """
+
+    def __init__(self, document: Document, watched: WatchedFolder, refresh: float) -> None:
+        self._watched = watched
+        self._runs = Select(title="Run", visible=False, width=480)
+        self._graphs = Slider(title="Graph", start=0, end=1, value=0, step=1, visible=False, width=480, show_value=False)
+        self._follows_newest = True
+        self._is_renewing = False
+        self._sections = {
+            name: Div(stylesheets=[style()], sizing_mode="stretch_width") for name in (*ABOVE_GRAPH, *BELOW_GRAPH)
+        }
+        self._sections["summary"].text = "<p>Reads the files ...</p>"
+        above, below = ([self._sections[name] for name in names] for names in (ABOVE_GRAPH, BELOW_GRAPH))
+        document.add_root(column(self._runs, *above, self._graphs, *below, sizing_mode="stretch_width"))
+        document.title = TITLE
+        document.template = jinja2.Environment(loader=jinja2.BaseLoader()).from_string(TEMPLATE)
+        document.template_variables.update(policy=POLICY, page_style=style())
+        self._runs.on_change("value", self._chose_run)
+        self._graphs.on_change("value_throttled", self._chose_graph)
+        document.add_next_tick_callback(self._renew)
+        document.add_periodic_callback(self._renew, round(1000 * refresh))
+        self._document = document
+
+    async def _renew(self) -> None:
+        name, number = self._runs.value or None, None if self._follows_newest else self._graphs.value
+        self._show(await asyncio.to_thread(self._watched.look, name, number))
+
+    def _show(self, view: View) -> None:
+        self._is_renewing = True
+        self._runs.update(options=list(view.runs), value=view.run or "", visible=len(view.runs) > 1)
+        last = len(view.moments) - 1
+        if self._follows_newest:
+            self._graphs.update(end=max(last, 1), value=max(last, 0))
+        else:
+            self._graphs.update(end=max(last, 1))
+        shown = min(int(self._graphs.value), last)
+        self._graphs.visible = last > 0
+        self._graphs.title = f"Graph {shown + 1} of {last + 1}, {view.moments[shown]}" if last > 0 else "Graph"
+        for name, section in self._sections.items():
+            section.update(text=view.sections.get(name, ""), visible=name in view.sections)
+        self._is_renewing = False
+
+    def _chose_run(self, attribute: str, old: str, new: str) -> None:
+        if not self._is_renewing:
+            self._follows_newest = True
+            self._document.add_next_tick_callback(self._renew)
+
+    def _chose_graph(self, attribute: str, old: int, new: int) -> None:
+        # The last one is the newest, also later
+        self._follows_newest = new == self._graphs.end
+        self._document.add_next_tick_callback(self._renew)
