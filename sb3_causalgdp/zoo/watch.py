@@ -3,10 +3,13 @@
 import argparse
 import math
 import os
+import signal
 import socket
 import sys
+import threading
 from collections.abc import Sequence
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 from sb3_causalgdp.hints import how_to_install
@@ -14,8 +17,8 @@ from sb3_causalgdp.zoo.registration import SetupError
 from sb3_causalgdp.zoo.watch_folder import WatchedFolder
 
 PROGRAM = "causalgdp-zoo watch"
-LOOPBACK = ("localhost", "127.0.0.1", "::1")
-NICENESS = 10
+LOOPBACK = ("localhost", "127.0.0.1")
+ANY = "0.0.0.0"
 
 
 def watch(argv: Sequence[str]) -> None:
@@ -28,11 +31,12 @@ def watch(argv: Sequence[str]) -> None:
     """
     arguments = _parser().parse_args(argv)
     _check(arguments)
-    # A training on the same machine goes first
-    if hasattr(os, "nice"):
-        os.nice(NICENESS)
-    if sys.platform == "linux" and not os.environ.get("DISPLAY"):
+    if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        # Films of MuJoCo's and of classic control's environments on a machine without a screen
         os.environ.setdefault("MUJOCO_GL", "egl")
+        os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, _end)
     watched = WatchedFolder(arguments.logdir, arguments.trusted, not arguments.no_play, arguments.seed)
     try:
         server = make_server(watched, arguments.host, arguments.port, arguments.refresh)
@@ -43,6 +47,11 @@ def watch(argv: Sequence[str]) -> None:
         pass
     finally:
         watched.close()
+
+
+def _end(number: int, frame: FrameType | None) -> None:
+    # The process that plays has to end, too
+    sys.exit(128 + number)
 
 
 def make_server(watched: WatchedFolder, host: str, port: int, refresh: float) -> Any:
@@ -62,18 +71,16 @@ def make_server(watched: WatchedFolder, host: str, port: int, refresh: float) ->
     except ImportError as error:
         raise ImportError(f"the page needs Bokeh ({error}): {how_to_install('watch')}") from error
     os.environ["BOKEH_RESOURCES"] = "server"
+
+    def open_page(document: Any) -> None:
+        WatchPage(document, watched, refresh)
+
     try:
-        listening = _socket(host, port)
+        port = port or _free_port(host)
+        origins = [f"{name}:{port}" for name in names_of(host)]
+        return Server({"/": open_page}, address=host, port=port, allow_websocket_origin=origins)
     except OSError as error:
         raise SetupError(f"cannot listen on --host {host} --port {port}: {error.strerror or error}") from error
-    port = listening.getsockname()[1]
-    listening.close()
-    return Server(
-        {"/": lambda document: WatchPage(document, watched, refresh)},
-        address=host,
-        port=port,
-        allow_websocket_origin=[f"{_bracketed(name)}:{port}" for name in names_of(host)],
-    )
 
 
 def names_of(host: str) -> list[str]:
@@ -84,9 +91,9 @@ def names_of(host: str) -> list[str]:
     if host in LOOPBACK:
         return list(LOOPBACK)
     own = [socket.gethostname(), socket.getfqdn()]
-    if host in ("0.0.0.0", "::"):
+    if host == ANY:
         addresses = {str(entry[4][0]) for name in own for entry in _addresses(name)}
-        return [*LOOPBACK, *own, *sorted(addresses)]
+        return [*LOOPBACK, *own, *sorted(address for address in addresses if ":" not in address)]
     return [host, *own]
 
 
@@ -97,13 +104,10 @@ def _addresses(name: str) -> list[Any]:
         return []
 
 
-def _socket(host: str, port: int) -> socket.socket:
-    family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    return socket.create_server((host, port), family=family)
-
-
-def _bracketed(host: str) -> str:
-    return f"[{host}]" if ":" in host else host
+def _free_port(host: str) -> int:
+    """The names under which the page may be called contain it, so that it has to be known before the server is there."""
+    with socket.create_server((host, 0)) as listening:
+        return listening.getsockname()[1]
 
 
 def url_of(host: str, port: int) -> str:
@@ -112,8 +116,7 @@ def url_of(host: str, port: int) -> str:
     :param port: Its port
     :return: What to open in a browser
     """
-    shown = {"0.0.0.0": socket.gethostname(), "::": socket.gethostname(), "127.0.0.1": "localhost"}.get(host, host)
-    return f"http://{_bracketed(shown)}:{port}/"
+    return f"http://{socket.gethostname() if host == ANY else host}:{port}/"
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -122,7 +125,7 @@ def _parser() -> argparse.ArgumentParser:
         "logdir",
         type=Path,
         metavar="LOGDIR",
-        help="folder of a run, of an algorithm, or of all: logs/causalgdp/Pendulum-v1_1, logs/causalgdp or logs; need not exist yet",
+        help="folder of a run, of an algorithm, or of all: logs/causalgdp/Pendulum-v1_1, logs/causalgdp, logs; it may be new",
     )
     parser.add_argument("--host", default="localhost", help="address to listen on (default: localhost, this machine alone)")
     parser.add_argument("--port", type=int, default=5007, help="port to listen on, 0 for a free one (default: 5007)")
@@ -140,5 +143,7 @@ def _check(arguments: argparse.Namespace) -> None:
         raise SetupError(f"--refresh must be from 0.1 to 3600 seconds, got {arguments.refresh:g}")
     if not 0 <= arguments.port <= 65_535:
         raise SetupError(f"--port must be from 0 to 65535, got {arguments.port}")
+    if ":" in arguments.host:
+        raise SetupError(f"--host must be a name or an IPv4 address, which is all that Bokeh checks, got {arguments.host}")
     if arguments.seed < 0:
         raise SetupError(f"--seed must be at least 0, got {arguments.seed}")

@@ -34,6 +34,7 @@ QUIET_SECONDS = 120.0
 NO_GRAPH = "None is known yet. Checkpoints (--save-freq) and the model of the best evaluation (--eval-freq) hold them."
 
 NO_MODEL = "There is no model yet. Checkpoints (--save-freq) and evaluations (--eval-freq) save them."
+PLAYS = "The newest model is playing an episode ..."
 
 Fingerprint = tuple[tuple[str, float, int], ...]
 
@@ -104,14 +105,11 @@ class WatchedFolder:
             run = RunFolder(paths[name], self.trusted)
             known = self._runs.setdefault(run.path, _Run())
             self._read(run, known)
-            if self.plays:
-                self._play(run, known)
-            graph = (
-                section_html(guarded("Causal graph", self._no_graph, run)) if not known.graphs else self._graph(known, number)
-            )
+            waiting = self._play(run, known) if self.plays else {}
             summary = section_html(guarded("Summary", summary_section, run, known.graphs))
+            graph = self._graph(known, number) if known.graphs else section_html(_no_graph(run))
             moments = tuple(_moment(graph) for graph in known.graphs)
-            return View(tuple(paths), name, moments, {"summary": summary, **known.html, "causal-graph": graph})
+            return View(tuple(paths), name, moments, {**waiting, **known.html, "summary": summary, "causal-graph": graph})
 
     def close(self) -> None:
         """
@@ -140,9 +138,6 @@ class WatchedFolder:
         _when_changed(known, "curve", fingerprint(run.path, CURVES), make_curve)
         _when_changed(known, "graphs", fingerprint(run.path, MODELS), make_graphs)
 
-    def _no_graph(self, run: RunFolder) -> Section:
-        return Section("Causal graph", [NO_GRAPH, *run.problems_with(".zip")])
-
     def _graph(self, known: _Run, number: int | None) -> str:
         last = len(known.graphs) - 1
         chosen = last if number is None else min(max(number, 0), last)
@@ -150,18 +145,18 @@ class WatchedFolder:
             known.drawn[chosen] = section_html(guarded("Causal graph", graph_section, known.graphs, chosen))
         return known.drawn[chosen]
 
-    def _play(self, run: RunFolder, known: _Run) -> None:
+    def _play(self, run: RunFolder, known: _Run) -> dict[str, str]:
+        """Lets the newest model play where it is due; what that is to show until it has."""
         if known.playing is not None and known.playing.done():
             known.html.update(known.playing.result())
             known.playing = None
-        if not run.models():
-            known.html["rollout"] = section_html(Section("Rollout", [NO_MODEL]))
-        elif known.playing is None and time.monotonic() >= known.may_play_at:
+        if run.models() and known.playing is None and time.monotonic() >= known.may_play_at:
 
             def start() -> None:
                 known.playing = self._pool.submit(self._played, Request(run.path, self.trusted, self.seed), known)
 
             _when_changed(known, "play", fingerprint(run.path, MODELS), start)
+        return {"rollout": section_html(Section("Rollout", [PLAYS if run.models() else NO_MODEL]))}
 
     def _played(self, request: Request, known: _Run) -> dict[str, str]:
         start = time.monotonic()
@@ -230,6 +225,10 @@ def _steps_done(run: RunFolder, graphs: list[CausalGraph]) -> int:
         max((steps for steps, _ in run.checkpoints()), default=0),
         max((graph.num_timesteps or 0 for graph in graphs), default=0),
     )
+
+
+def _no_graph(run: RunFolder) -> Section:
+    return Section("Causal graph", [NO_GRAPH, *run.problems_with(".zip")])
 
 
 def graph_section(graphs: list[CausalGraph], number: int) -> Section:

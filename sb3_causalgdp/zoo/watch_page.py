@@ -1,20 +1,30 @@
 """The page of a watched folder, for Bokeh's server: what each browser that opens it shows, and how that is renewed."""
 
 import asyncio
+from typing import Any
 
 import jinja2
-from bokeh.document import Document
-from bokeh.layouts import column
-from bokeh.models import Div, Select, Slider
+from bokeh.layouts import column, row
+from bokeh.models.widgets import Div, Select, Slider
 
 from sb3_causalgdp.zoo.pages import style
 from sb3_causalgdp.zoo.watch_folder import View, WatchedFolder
 
+# Bokeh's own letters are smaller than those of the page
+STYLES: dict[str, str | None] = {"font-size": "1rem", "max-width": "100%"}
 TITLE = "CausalGDP in training"
 ABOVE_GRAPH = ("summary", "learning-curve", "rollout")
 BELOW_GRAPH = ("causal-graph", "history-of-the-graph", "effects-of-the-actions", "guidance-along-the-denoising-chain")
 # A page must not load anything from elsewhere, whatever stands on it
-POLICY = "default-src 'self'; script-src 'self' 'unsafe-inline' 'unsafe-eval'; style-src 'self' 'unsafe-inline'; img-src 'self' data:"
+POLICY = "; ".join(
+    [
+        "default-src 'self'",
+        # Bokeh's own scripts are in the page, and compile templates
+        "script-src 'self' 'unsafe-inline' 'unsafe-eval'",
+        "style-src 'self' 'unsafe-inline'",
+        "img-src 'self' data:",
+    ]
+)
 TEMPLATE = """{% extends base %}
 {% block preamble %}
 <meta http-equiv="Content-Security-Policy" content="{{ policy }}">
@@ -23,8 +33,10 @@ TEMPLATE = """{% extends base %}
 <style>{{ page_style }}</style>
 {% endblock %}
 {% block contents %}
+<main>
 <h1>{{ title }}</h1>
 {{ super() }}
+</main>
 {% endblock %}
 """
 
@@ -33,34 +45,33 @@ class WatchPage:
     """
     A page in one browser.
 
-    :param document: Bokeh's document of the page
+    :param document: Bokeh's ``Document`` of the page
     :param watched: What it shows
     :param refresh: Seconds between looks
     """
 
-    def __init__(self, document: Document, watched: WatchedFolder, refresh: float) -> None:
+    def __init__(self, document: Any, watched: WatchedFolder, refresh: float) -> None:
+        self._document = document
         self._watched = watched
         self._runs = Select(title="Run", visible=False, width=480)
         self._graphs = Slider(title="Graph", start=0, end=1, value=0, step=1, visible=False, width=480, show_value=False)
         self._follows_newest = True
         self._is_renewing = False
-        self._sections = {
-            name: Div(stylesheets=[style()], sizing_mode="stretch_width") for name in (*ABOVE_GRAPH, *BELOW_GRAPH)
-        }
+        self._sections = {name: Div(stylesheets=[style()], styles=STYLES) for name in (*ABOVE_GRAPH, *BELOW_GRAPH)}
         self._sections["summary"].text = "<p>Reads the files ...</p>"
         above, below = ([self._sections[name] for name in names] for names in (ABOVE_GRAPH, BELOW_GRAPH))
-        document.add_root(column(self._runs, *above, self._graphs, *below, sizing_mode="stretch_width"))
+        beside = row(*above, styles={"flex-wrap": "wrap", "gap": "0 2rem"}, sizing_mode="stretch_width")
+        document.add_root(column(self._runs, beside, self._graphs, *below, sizing_mode="stretch_width"))
         document.title = TITLE
         document.template = jinja2.Environment(loader=jinja2.BaseLoader()).from_string(TEMPLATE)
         document.template_variables.update(policy=POLICY, page_style=style())
         self._runs.on_change("value", self._chose_run)
         self._graphs.on_change("value_throttled", self._chose_graph)
-        document.add_next_tick_callback(self._renew)
-        document.add_periodic_callback(self._renew, round(1000 * refresh))
-        self._document = document
+        self._document.add_next_tick_callback(self._renew)
+        self._document.add_periodic_callback(self._renew, round(1000 * refresh))
 
     async def _renew(self) -> None:
-        name, number = self._runs.value or None, None if self._follows_newest else self._graphs.value
+        name, number = self._runs.value or None, None if self._follows_newest else int(self._graphs.value)
         self._show(await asyncio.to_thread(self._watched.look, name, number))
 
     def _show(self, view: View) -> None:

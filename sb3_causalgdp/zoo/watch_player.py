@@ -1,9 +1,11 @@
-"""The newest model of a run plays, in a process of its own: drawing on a screen's card belongs to a main thread, and may fail."""
+"""The newest model of a run plays, in a process of its own: rendering belongs to a main thread, and may end the process."""
 
 import base64
 import io
 import multiprocessing
+import os
 from collections.abc import Callable
+from contextlib import suppress
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import NamedTuple
@@ -31,6 +33,7 @@ MOST_STEPS = 1_000
 MOST_FRAMES = 120
 FRAME_WIDTH = 320
 FRAME_MILLISECONDS = 60
+NICENESS = 5
 
 
 class Request(NamedTuple):
@@ -143,21 +146,17 @@ def serve(connection: Connection, work: Callable[[Request], list[Section]] = sec
     :param connection: Requests come in, lists of title and HTML go out
     :param work: What makes the answer
     """
+    # A training on the same machine goes first
     th.set_num_threads(1)
-    while True:
-        try:
-            request = connection.recv()
-        except (EOFError, KeyboardInterrupt):
-            return
-        connection.send([(section.id, section_html(section)) for section in guarded_sections(work, request)])
+    if hasattr(os, "nice"):
+        os.nice(NICENESS)
+    with suppress(EOFError, OSError, KeyboardInterrupt):
+        while True:
+            sections = _answer(work, connection.recv())
+            connection.send([(section.id, section_html(section)) for section in sections])
 
 
-def guarded_sections(work: Callable[[Request], list[Section]], request: Request) -> list[Section]:
-    """
-    :param work: What makes sections
-    :param request: Of what
-    :return: They, or the reason why there are none
-    """
+def _answer(work: Callable[[Request], list[Section]], request: Request) -> list[Section]:
     try:
         return work(request)
     except Exception as error:  # files that are replaced meanwhile, or are damaged, can raise anything
