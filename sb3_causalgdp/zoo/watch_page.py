@@ -53,8 +53,10 @@ class WatchPage:
     def __init__(self, document: Any, watched: WatchedFolder, refresh: float) -> None:
         self._document = document
         self._watched = watched
-        self._runs = Select(title="Run", visible=False, width=480)
-        self._graphs = Slider(title="Graph", start=0, end=1, value=0, step=1, visible=False, width=480, show_value=False)
+        self._runs = Select(name="runs", title="Run", visible=False, width=480)
+        self._graphs = Slider(
+            name="graphs", title="Graph", start=0, end=1, value=0, step=1, visible=False, width=480, show_value=False
+        )
         self._follows_newest = True
         self._is_renewing = False
         self._sections = {name: Div(stylesheets=[style()], styles=STYLES) for name in (*ABOVE_GRAPH, *BELOW_GRAPH)}

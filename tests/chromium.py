@@ -31,7 +31,7 @@ TEXT = """(() => {
         const children = [...(node.shadowRoot ? node.shadowRoot.childNodes : []), ...node.childNodes];
         return children.map(text).join(" ");
     };
-    return text(document.body).replace(/\\s+/g, " ");
+    return document.body === null ? "" : text(document.body).replace(/\\s+/g, " ");
 })()"""
 PICTURES = """(() => {
     const all = node => [
