@@ -77,7 +77,14 @@ def publish_checkpoint(env: str, seed: int, kwargs: Mapping[str, Any], checkpoin
     words = ["python", "benchmarks/learning/run.py", "--env", env, "--steps", str(steps), "--seeds", str(seed)]
     words += ["--kwargs", json.dumps(kwargs)] if kwargs else []
     config = {"n_timesteps": steps, "policy": "MlpPolicy", **kwargs}
-    arguments = {"algo": ALGORITHM, "env": env, "env_kwargs": None, "gym_packages": [], "n_timesteps": -1, "seed": seed}
+    arguments: dict[str, Any] = {
+        "algo": ALGORITHM,
+        "env": env,
+        "env_kwargs": None,
+        "gym_packages": [],
+        "n_timesteps": -1,
+        "seed": seed,
+    }
     return _publish(model, arguments, config, shlex.join(words), installed_versions(), folder, episodes)
 
 
@@ -167,7 +174,8 @@ def evaluated(path: Path, env: str, seed: int, episodes: int) -> dict[str, Any]:
     :param episodes: How many to play, as ``run.py`` does
     :return: Mean and standard deviation of their returns, and the share of successes where the environment tells
     """
-    environments, successes = make_environments(env, episodes), []
+    environments = make_environments(env, episodes)
+    successes: list[bool | None] = []
 
     def look(local: dict[str, Any], _: dict[str, Any]) -> None:
         if local["done"]:
@@ -176,7 +184,8 @@ def evaluated(path: Path, env: str, seed: int, episodes: int) -> dict[str, Any]:
 
     environments.seed(10_000 + seed)
     model = CausalGDP.load(path, env=environments, device="cpu")
-    mean, std = evaluate_policy(model, environments, n_eval_episodes=episodes, warn=False, callback=look)
+    mean_and_std: Any = evaluate_policy(model, environments, n_eval_episodes=episodes, warn=False, callback=look)
+    mean, std = mean_and_std
     told = [success for success in successes if success is not None]
     facts = {"episodes": episodes, "return": round(float(mean), 1), "spread": round(float(std), 1)}
     return {**facts, "success_rate": round(float(np.mean(told)), 2)} if told else facts

@@ -11,10 +11,19 @@ from sb3_causalgdp.zoo.pages import style
 from sb3_causalgdp.zoo.watch_folder import View, WatchedFolder
 
 # Bokeh's own letters are smaller than those of the page
-STYLES: dict[str, str | None] = {"font-size": "1rem", "max-width": "100%"}
+STYLES: dict[str, str | None] = {"font-size": "1rem"}
 TITLE = "CausalGDP in training"
-ABOVE_GRAPH = ("summary", "learning-curve", "rollout")
-BELOW_GRAPH = ("causal-graph", "history-of-the-graph", "effects-of-the-actions", "guidance-along-the-denoising-chain")
+SECTIONS = (
+    "summary",
+    "learning-curve",
+    "rollout",
+    "causal-graph",
+    "history-of-the-graph",
+    "effects-of-the-actions",
+    "guidance-along-the-denoising-chain",
+)
+# As wide as the film
+WIDTHS = {"rollout": "23rem"}
 # A page must not load anything from elsewhere, whatever stands on it
 POLICY = "; ".join(
     [
@@ -59,11 +68,14 @@ class WatchPage:
         )
         self._follows_newest = True
         self._is_renewing = False
-        self._sections = {name: Div(stylesheets=[style()], styles=STYLES) for name in (*ABOVE_GRAPH, *BELOW_GRAPH)}
+        self._sections = {
+            name: Div(stylesheets=[style()], styles={**STYLES, "max-width": WIDTHS.get(name, "100%")}) for name in SECTIONS
+        }
         self._sections["summary"].text = "<p>Reads the files ...</p>"
-        above, below = ([self._sections[name] for name in names] for names in (ABOVE_GRAPH, BELOW_GRAPH))
-        beside = row(*above, styles={"flex-wrap": "wrap", "gap": "0 2rem"}, sizing_mode="stretch_width")
-        document.add_root(column(self._runs, beside, self._graphs, *below, sizing_mode="stretch_width"))
+        summary, curve, rollout, *others = self._sections.values()
+        # One below the other where the window is narrow
+        top = row(curve, rollout, styles={"flex-wrap": "wrap", "gap": "0 2rem"}, sizing_mode="stretch_width")
+        document.add_root(column(self._runs, summary, top, self._graphs, *others, sizing_mode="stretch_width"))
         document.title = TITLE
         document.template = jinja2.Environment(loader=jinja2.BaseLoader()).from_string(TEMPLATE)
         document.template_variables.update(policy=POLICY, page_style=style())
