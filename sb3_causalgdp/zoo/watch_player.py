@@ -139,17 +139,17 @@ def _rollout_section(name: str, played: Played, film: Film | None, problem: str 
     return Section("Rollout", [*remarks, f"No film: {why.rstrip('.')}."])
 
 
-def serve(connection: Connection, work: Callable[[Request], list[Section]] = sections_of_play) -> None:
+def serve(connection: Connection, work: Callable[[Request], list[Section]], niceness: int) -> None:
     """
     Answer requests until the other end is closed.
 
     :param connection: Requests come in, lists of title and HTML go out
     :param work: What makes the answer
+    :param niceness: How far others on the machine go first
     """
-    # A training on the same machine goes first
     th.set_num_threads(1)
     if hasattr(os, "nice"):
-        os.nice(NICENESS)
+        os.nice(niceness)
     with suppress(EOFError, OSError, KeyboardInterrupt):
         while True:
             sections = _answer(work, connection.recv())
@@ -171,10 +171,12 @@ class Player:
     The other process, which is started when it is needed.
 
     :param work: What it does with a request
+    :param niceness: How far others on the machine, such as the training, go first
     """
 
-    def __init__(self, work: Callable[[Request], list[Section]] = sections_of_play) -> None:
+    def __init__(self, work: Callable[[Request], list[Section]] = sections_of_play, niceness: int = NICENESS) -> None:
         self._work = work
+        self._niceness = niceness
         self._process: multiprocessing.process.BaseProcess | None = None
         self._connection: Connection | None = None
 
@@ -195,7 +197,7 @@ class Player:
         if self._connection is None:
             context = multiprocessing.get_context("spawn")
             self._connection, theirs = context.Pipe()
-            self._process = context.Process(target=serve, args=(theirs, self._work), daemon=True)
+            self._process = context.Process(target=serve, args=(theirs, self._work, self._niceness), daemon=True)
             self._process.start()
             # Once both ends are closed here, the process sees when this one ends, however it ends
             theirs.close()

@@ -12,7 +12,6 @@ import sys
 import threading
 import time
 import urllib.request
-from contextlib import contextmanager
 
 import chromium
 import numpy as np
@@ -41,6 +40,8 @@ def run(trained_run, folder):
     copy = folder / "logs" / "causalgdp" / trained_run.name
     shutil.copytree(trained_run, copy)
     (copy / "Pendulum-v1.zip").rename(folder / "final.zip")
+    # Which evaluation was the best depends on rounding
+    shutil.copy(copy / "rl_model_110_steps.zip", copy / "best_model.zip")
     return copy
 
 
@@ -75,7 +76,7 @@ def says(watched, *arguments):
 
 @pytest.fixture
 def watched(folder):
-    watched = WatchedFolder(folder / "logs", plays=False)
+    watched = WatchedFolder(folder / "logs", plays=False, player=Player(niceness=0))
     yield watched
     watched.close()
 
@@ -226,7 +227,7 @@ def ends(request):
 
 
 def test_a_renderer_that_ends_its_process_does_not_end_the_page(run):
-    player = Player(ends)
+    player = Player(ends, niceness=0)
     assert "the process that plays ended" in player.play(Request(run, False, 1))["rollout"]
     first = player.play(Request(run, False, 0))["rollout"]
     assert run.name in first and str(os.getpid()) not in first
@@ -331,19 +332,16 @@ def served(watched):
     thread.join()
 
 
-@contextmanager
-def started(*arguments):
-    """The address of the command's page."""
-    command = [sys.executable, "-m", "sb3_causalgdp.zoo", "watch", *map(str, arguments), "--port", "0", "--refresh", "0.5"]
+def test_the_command_serves_the_page_until_it_is_interrupted(run):
+    command = [sys.executable, "-m", "sb3_causalgdp.zoo", "watch", "logs", "--port", "0", "--no-play"]
     surroundings = {**os.environ, "OMP_NUM_THREADS": "1"}
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=surroundings)
+    url = re.fullmatch(r"Watch logs at (http://localhost:\d+/) \(Ctrl-C ends it\)\n", process.stdout.readline())[1]
     try:
-        yield re.search(r"at (http://\S+) ", process.stdout.readline())[1]
+        assert "<title>CausalGDP in training</title>" in urllib.request.urlopen(url).read().decode()
     finally:
         process.send_signal(signal.SIGINT)
-        status = process.wait(60)
-        process.stdout.close()
-    assert status == 0
+        assert process.communicate(timeout=60)[0] == "" and process.returncode == 0
 
 
 def test_pages_of_others_get_no_answer(served):
@@ -394,13 +392,14 @@ def test_a_browser_shows_the_training_as_it_goes_on(served, run, folder, tmp_pat
 
 
 @needs_chromium
-def test_a_browser_shows_an_older_graph_another_run_and_the_film(run, tmp_path):
+def test_a_browser_shows_an_older_graph_another_run_and_the_film(served, watched, run, tmp_path):
     other = run.with_name("Other-v0_1")
     shutil.copytree(run, other)
     for path in other.glob("*"):
         os.utime(path, (1e9, 1e9))
-    with chromium.browser(tmp_path / "profile") as browser, started("logs") as url:
-        browser.open(url)
+    watched.plays = True
+    with chromium.browser(tmp_path / "profile") as browser:
+        browser.open(served)
         browser.wait_for(
             "Graph 2 of 2", "What the policy does in one episode.", "What the causal world model says", seconds=300
         )
