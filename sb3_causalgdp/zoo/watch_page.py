@@ -66,7 +66,8 @@ class WatchPage:
         self._graphs = Slider(
             name="graphs", title="Graph", start=0, end=1, value=0, step=1, visible=False, width=480, show_value=False
         )
-        self._follows_newest = True
+        # None follows the newest
+        self._chosen: int | None = None
         self._is_renewing = False
         self._sections = {
             name: Div(stylesheets=[style()], styles={**STYLES, "max-width": WIDTHS.get(name, "100%")}) for name in SECTIONS
@@ -80,24 +81,20 @@ class WatchPage:
         document.template = jinja2.Environment(loader=jinja2.BaseLoader()).from_string(TEMPLATE)
         document.template_variables.update(policy=POLICY, page_style=style())
         self._runs.on_change("value", self._chose_run)
-        self._graphs.on_change("value_throttled", self._chose_graph)
+        self._graphs.on_change("value", self._moved_slider)
+        self._graphs.on_change("value_throttled", self._let_go_of_slider)
         self._document.add_next_tick_callback(self._renew)
         self._document.add_periodic_callback(self._renew, round(1000 * refresh))
 
     async def _renew(self) -> None:
-        name, number = self._runs.value or None, None if self._follows_newest else int(self._graphs.value)
-        self._show(await asyncio.to_thread(self._watched.look, name, number))
+        self._show(await asyncio.to_thread(self._watched.look, self._runs.value or None, self._chosen))
 
     def _show(self, view: View) -> None:
         self._is_renewing = True
         self._runs.update(options=list(view.runs), value=view.run or "", visible=len(view.runs) > 1)
         last = len(view.moments) - 1
-        if self._follows_newest:
-            self._graphs.update(end=max(last, 1), value=max(last, 0))
-        else:
-            self._graphs.update(end=max(last, 1))
-        shown = min(int(self._graphs.value), last)
-        self._graphs.visible = last > 0
+        shown = max(last, 0) if self._chosen is None else min(self._chosen, max(last, 0))
+        self._graphs.update(end=max(last, 1), value=shown, visible=last > 0)
         self._graphs.title = f"Graph {shown + 1} of {last + 1}, {view.moments[shown]}" if last > 0 else "Graph"
         for name, section in self._sections.items():
             section.update(text=view.sections.get(name, ""), visible=name in view.sections)
@@ -105,10 +102,14 @@ class WatchPage:
 
     def _chose_run(self, attribute: str, old: str, new: str) -> None:
         if not self._is_renewing:
-            self._follows_newest = True
+            self._chosen = None
             self._document.add_next_tick_callback(self._renew)
 
-    def _chose_graph(self, attribute: str, old: int, new: int) -> None:
-        # The last one is the newest, also later
-        self._follows_newest = new == self._graphs.end
+    def _moved_slider(self, attribute: str, old: float, new: float) -> None:
+        # The last graph is the newest, also later
+        if not self._is_renewing:
+            self._chosen = None if new == self._graphs.end else int(new)
+
+    def _let_go_of_slider(self, attribute: str, old: float, new: float) -> None:
+        self._moved_slider(attribute, old, new)
         self._document.add_next_tick_callback(self._renew)
