@@ -39,7 +39,7 @@ TEMPLATE = """{% extends base %}
 <meta http-equiv="Content-Security-Policy" content="{{ policy }}">
 <meta name="viewport" content="width=device-width, initial-scale=1">
 <meta name="color-scheme" content="light">
-<style>{{ page_style }}</style>
+<style>{{ page_style }} body { max-width: none; padding: 0; }</style>
 {% endblock %}
 {% block contents %}
 <main>
@@ -62,20 +62,31 @@ class WatchPage:
     def __init__(self, document: Any, watched: WatchedFolder, refresh: float) -> None:
         self._document = document
         self._watched = watched
-        self._runs = Select(name="runs", title="Run", visible=False, width=480)
+        self._runs = Select(name="runs", title="Run", visible=False, sizing_mode="stretch_width", max_width=480, margin=0)
         self._graphs = Slider(
-            name="graphs", title="Graph", start=0, end=1, value=0, step=1, visible=False, width=480, show_value=False
+            name="graphs",
+            title="Graph",
+            start=0,
+            end=1,
+            value=0,
+            step=1,
+            show_value=False,
+            visible=False,
+            sizing_mode="stretch_width",
+            max_width=480,
+            margin=0,
         )
         # None follows the newest
         self._chosen: int | None = None
         self._is_renewing = False
         self._sections = {
-            name: Div(stylesheets=[style()], styles={**STYLES, "max-width": WIDTHS.get(name, "100%")}) for name in SECTIONS
+            name: Div(stylesheets=[style()], styles={**STYLES, "max-width": WIDTHS.get(name, "100%")}, margin=0)
+            for name in SECTIONS
         }
         self._sections["summary"].text = "<p>Reads the files ...</p>"
         summary, curve, rollout, *others = self._sections.values()
         # One below the other where the window is narrow
-        top = row(curve, rollout, styles={"flex-wrap": "wrap", "gap": "0 2rem"}, sizing_mode="stretch_width")
+        top = row(curve, rollout, styles={"flex-wrap": "wrap", "gap": "0 1.5rem"}, sizing_mode="stretch_width")
         document.add_root(column(self._runs, summary, top, self._graphs, *others, sizing_mode="stretch_width"))
         document.title = TITLE
         document.template = jinja2.Environment(loader=jinja2.BaseLoader()).from_string(TEMPLATE)
