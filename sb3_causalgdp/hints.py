@@ -6,6 +6,7 @@ EXTRAS = {
     "plots": ("matplotlib", "networkx", "pandas"),
     "offline": ("minari[hdf5]", "gymnasium-robotics"),
     "zoo": ("rl-zoo3>=2.7", "sb3-contrib", "requests", "seaborn", "moviepy", "jinja2"),
+    "watch": ("bokeh",),
     "lingam": ("lingam",),
     "export": ("onnx", "onnxscript", "onnxruntime"),
     "train": ("tqdm", "rich", "tensorboard"),

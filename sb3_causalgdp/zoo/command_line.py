@@ -31,7 +31,9 @@ SCRIPTS = {
     "all_plots": "compare evaluations, make a table",
     "plot_from_file": "plot what all_plots wrote",
     "report": "write a page about a training and its causal graph",
+    "watch": "follow a training on a page in the browser",
 }
+OWN = ("report", "watch")
 PLOTS = ("all_plots", "plot_from_file", "plot_train")
 PLAYING = ("enjoy", "record_video")
 # RL Zoo's defaults for these are PPO and CartPole
@@ -55,7 +57,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     if script not in SCRIPTS:
         _fail(PROGRAM, f"unknown script {script!r}, it must be one of {', '.join(SCRIPTS)}")
     trusted = TRUST_OPTION in arguments
-    if script != "report":
+    if script not in OWN:
         arguments = [one for one in arguments if one != TRUST_OPTION]
     if script in OF_ONE_ENVIRONMENT:
         arguments = _with_algorithm(script, arguments)
@@ -94,7 +96,7 @@ def _usage() -> str:
         [
             f"usage: {PROGRAM} [--traceback] SCRIPT ...",
             "",
-            "RL Zoo's scripts, with --algo causalgdp beside RL Zoo's own algorithms, and a report. SCRIPT is one of:",
+            "RL Zoo's scripts, with --algo causalgdp beside RL Zoo's own algorithms, and pages about them. SCRIPT is one of:",
             *(f"  {name:<{width}}  {what}" for name, what in SCRIPTS.items()),
             "",
             f"{PROGRAM} SCRIPT --help lists the arguments of a script; --traceback shows where an error comes from.",
@@ -115,8 +117,8 @@ def _prepare(script: str, arguments: Sequence[str], trusted: bool) -> None:
 
 
 def _run(script: str, arguments: Sequence[str]) -> None:
-    if script == "report":
-        importlib.import_module("sb3_causalgdp.zoo.report").report(arguments)
+    if script in OWN:
+        getattr(importlib.import_module(f"sb3_causalgdp.zoo.{script}"), script)(arguments)
     elif script in PLOTS:
         getattr(importlib.import_module("rl_zoo3.plots"), script)()
     else:

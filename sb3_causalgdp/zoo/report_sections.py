@@ -42,11 +42,12 @@ Observations = np.ndarray | dict[str, np.ndarray]
 
 @dataclass(frozen=True)
 class Picture:
-    """A PNG in base64, ``width`` CSS pixels wide."""
+    """A picture in base64, ``width`` CSS pixels wide."""
 
     caption: str
     data: str
     width: int
+    format: str = "png"
 
 
 @dataclass(frozen=True)
@@ -129,21 +130,26 @@ def make_sections(
     """
     transitions = _transitions(run, model, played)
     return [
-        _guarded("Summary", _summary_section, run, model, kind, model_path),
-        _guarded("Learning curve", _learning_section, run),
-        _guarded("Causal graph", _graph_section, model),
-        _guarded("History of the graph", _history_section, run, model),
-        _guarded("Effects of the actions", _effects_section, run, model, transitions),
-        _guarded("Guidance along the denoising chain", _guidance_section, run, model, transitions),
-        _guarded("Evaluation", _evaluation_section, played, problem),
-        _guarded("Hyperparameters", _hyperparameter_section, run, model_path),
-        _guarded("Versions", _version_section, run, model_path),
-        _guarded("Command", _command_section, run),
+        guarded("Summary", _summary_section, run, model, kind, model_path),
+        guarded("Learning curve", learning_section, run),
+        guarded("Causal graph", _graph_section, model),
+        guarded("History of the graph", _history_section, run, model),
+        guarded("Effects of the actions", effects_section, run, model, transitions),
+        guarded("Guidance along the denoising chain", guidance_section, run, model, transitions),
+        guarded("Evaluation", _evaluation_section, played, problem),
+        guarded("Hyperparameters", _hyperparameter_section, run, model_path),
+        guarded("Versions", _version_section, run, model_path),
+        guarded("Command", _command_section, run),
     ]
 
 
-def _guarded(title: str, make: Callable[..., Section], *args: Any) -> Section:
-    """The section, or why there is none: one that fails must not take the others with it."""
+def guarded(title: str, make: Callable[..., Section], *args: Any) -> Section:
+    """
+    :param title: Of the section
+    :param make: What makes it
+    :param args: Of that
+    :return: The section, or why there is none: one that fails must not take the others with it
+    """
     try:
         return make(*args)
     except Exception as error:
@@ -159,6 +165,14 @@ def _transitions(run: RunFolder, model: CausalGDP, played: Played) -> Transition
             return Transitions(observations, actions, f"{len(actions):,} transitions drawn from {path.name}")
     except Exception as error:  # a damaged file can raise anything
         run.note(path.name, error)
+    return transitions_played(played)
+
+
+def transitions_played(played: Played) -> Transitions | None:
+    """
+    :param played: What the policy did
+    :return: Some of it, None if it did nothing
+    """
     if not played.actions:
         return None
     chosen = np.linspace(0, len(played.actions) - 1, min(OBSERVATIONS, len(played.actions))).astype(int)
@@ -203,7 +217,11 @@ def _evaluation(evaluations: Evaluations, index: int) -> str:
     return text if rates is None else f"{text}, success rate {rates[index]:.0%}"
 
 
-def _learning_section(run: RunFolder) -> Section:
+def learning_section(run: RunFolder) -> Section:
+    """
+    :param run: A run
+    :return: Its returns
+    """
     remarks, pictures = [], []
     episodes, evaluations = run.training_episodes(), run.evaluations()
     if episodes is None:
@@ -220,13 +238,15 @@ def _learning_section(run: RunFolder) -> Section:
         if evaluations is not None:
             _draw_evaluations(axes, evaluations)
         _finish_curve(axes, "environment steps")
-        pictures.append(_picture(figure, "Returns of the training episodes, with exploration noise, and of the evaluations."))
+        pictures.append(
+            make_picture(figure, "Returns of the training episodes, with exploration noise, and of the evaluations.")
+        )
     if offline is not None:
         figure = Figure(figsize=(8.0, 3.2), layout="constrained")
         axes = figure.add_subplot()
         _draw_evaluations(axes, offline)
         _finish_curve(axes, "gradient steps")
-        pictures.append(_picture(figure, "Evaluations of the offline stage, before the first step in the environment."))
+        pictures.append(make_picture(figure, "Evaluations of the offline stage, before the first step in the environment."))
     return Section("Learning curve", remarks, pictures)
 
 
@@ -264,7 +284,19 @@ def _graph_section(model: CausalGDP) -> Section:
     title = "Causal graph"
     if model._causal_graph is None:
         return Section(title, ["None was found yet: the training was shorter than causal_refresh_freq, or had too few data."])
-    graph = model.causal_graph()
+    graph, gate = model.causal_graph(), model.relevance_gate
+    remarks = graph_remarks(graph)
+    if gate is not None:
+        hidden = [name for name, shown in zip(gate.names, (*gate.states, *gate.actions), strict=True) if not shown]
+        remarks.append(f"Hidden from actor and critics: {', '.join(hidden) or 'nothing'}.")
+    return Section(title, remarks, graph_pictures(graph), tables=[edge_table(graph), _relevance_table(graph, model)])
+
+
+def graph_remarks(graph: CausalGraph) -> list[str]:
+    """
+    :param graph: A causal graph
+    :return: What limits it, in sentences
+    """
     when = "" if graph.num_timesteps is None else f" after {graph.num_timesteps:,} environment steps"
     remarks = [
         f"Found{when} by {graph.method} from {graph.n_samples:,} transitions. A mask is the probability of an edge, a "
@@ -272,29 +304,34 @@ def _graph_section(model: CausalGDP) -> Section:
     ]
     if graph.constant_variables:
         remarks.append(f"Never moved, and have no edges: {', '.join(graph.constant_variables)}.")
-    if model.relevance_gate is not None:
-        gate = model.relevance_gate
-        hidden = [name for name, shown in zip(gate.names, (*gate.states, *gate.actions), strict=True) if not shown]
-        remarks.append(f"Hidden from actor and critics: {', '.join(hidden) or 'nothing'}.")
     for group in graph.duplicated_variables:
         remarks.append(f"Are linear functions of each other, and share their masks: {', '.join(group)}.")
-    remarks += [f"{remark}." for remark in graph.remarks]
-    pictures = [
-        _picture(plot_causal_graph(graph, kind="heat_map"), "Effects, in standard deviations: a column causes a row."),
-        _picture(plot_causal_graph(graph, kind="graph"), "The strongest causes of each effect: from now, on the left, on."),
+    return remarks + [f"{remark}." for remark in graph.remarks]
+
+
+def graph_pictures(graph: CausalGraph) -> list[Picture]:
+    """
+    :param graph: A causal graph
+    :return: Its effects, and its strongest edges
+    """
+    return [
+        make_picture(plot_causal_graph(graph, kind="heat_map"), "Effects, in standard deviations: a column causes a row."),
+        make_picture(
+            plot_causal_graph(graph, kind="graph"), "The strongest causes of each effect: from now, on the left, on."
+        ),
     ]
+
+
+def edge_table(graph: CausalGraph, folded: bool = True) -> Table:
+    """
+    :param graph: A causal graph
+    :param folded: Whether a click opens it
+    :return: Its strongest edges
+    """
     edges = sorted(graph.edges(), key=lambda edge: -abs(edge.strength))
     rows = [(edge.cause, edge.effect, f"{edge.mask:.2f}", _strength(edge.strength, edge.standard_error)) for edge in edges]
-    tables = [
-        Table(
-            ("cause", "effect", "mask", "strength"),
-            rows[:MOST_EDGES],
-            f"The {min(MOST_EDGES, len(rows))} strongest of {len(rows)} edges",
-            folded=True,
-        ),
-        _relevance_table(graph, model),
-    ]
-    return Section(title, remarks, pictures, tables=tables)
+    title = f"The {min(MOST_EDGES, len(rows))} strongest of {len(rows)} edges"
+    return Table(("cause", "effect", "mask", "strength"), rows[:MOST_EDGES], title, folded)
 
 
 def _relevance_table(graph: CausalGraph, model: CausalGDP) -> Table:
@@ -311,15 +348,29 @@ def _relevance_table(graph: CausalGraph, model: CausalGDP) -> Table:
     )
 
 
-def _history_section(run: RunFolder, model: CausalGDP) -> Section:
-    title = "History of the graph"
+def known_graphs(run: RunFolder, newest: CausalGraph | None = None) -> tuple[list[CausalGraph], str]:
+    """
+    :param run: A run
+    :param newest: A graph that may be newer than those of its files
+    :return: The graphs of the training that are known, oldest first, and where they are from
+    """
     graphs, source = run.graph_history(), "the model at the end of the training"
     if len(graphs) < 2:
         graphs, source = run.checkpoint_graphs(), "the checkpoints (--save-freq), each of which holds the graph of its time"
-        newest = model._causal_graph
         if newest is not None and (not graphs or graphs[-1].num_timesteps != newest.num_timesteps):
             before = [graph for graph in graphs if (graph.num_timesteps or 0) < (newest.num_timesteps or 0)]
             graphs = [*before, newest]
+    return graphs, source
+
+
+def history_section(run: RunFolder, graphs: Sequence[CausalGraph], source: str) -> Section:
+    """
+    :param run: A run
+    :param graphs: What :func:`known_graphs` gives
+    :param source: The same
+    :return: How the graph changed
+    """
+    title = "History of the graph"
     if len(graphs) < 2:
         known = "one graph is known" if graphs else "no graph is known"
         return Section(
@@ -337,17 +388,31 @@ def _history_section(run: RunFolder, model: CausalGDP) -> Section:
             f"{len(graphs)} graphs, from {source}. Below the picture: what changed from {_moment(first)} to {_moment(last)}.",
             *run.problems_with(".zip"),
         ],
-        [_picture(plot_history(graphs), caption)],
-        [_changes(last.diff(first))],
+        [make_picture(plot_history(graphs), caption)],
+        [graph_changes(last.diff(first))],
     )
 
 
-def _changes(changes: GraphDiff) -> Text:
+def _history_section(run: RunFolder, model: CausalGDP) -> Section:
+    return history_section(run, *known_graphs(run, model._causal_graph))
+
+
+def graph_changes(changes: GraphDiff) -> Text:
+    """
+    :param changes: From one graph to a later one
+    :return: Them, folded where they are many
+    """
     counts = [f"{len(edges)} {name}" for name, edges in changes._asdict().items() if edges]
     return Text(str(changes), f"Edges: {', '.join(counts)}" if sum(map(len, changes)) > MOST_CHANGES else "")
 
 
-def _effects_section(run: RunFolder, model: CausalGDP, transitions: Transitions | None) -> Section:
+def effects_section(run: RunFolder, model: CausalGDP, transitions: Transitions | None) -> Section:
+    """
+    :param run: A run
+    :param model: Its model
+    :param transitions: On which it is computed
+    :return: What the actions do
+    """
     title = "Effects of the actions"
     problems = run.problems_with("replay_buffer.npz", "replay_buffer.pkl")
     if transitions is None:
@@ -366,12 +431,18 @@ def _effects_section(run: RunFolder, model: CausalGDP, transitions: Transitions 
     return Section(
         title,
         [f"From {transitions.source}.", *problems],
-        [_picture(effects.plot(), caption)],
+        [make_picture(effects.plot(), caption)],
         tables=[Table(header, rows, "The numbers, ± one standard error", folded=True)],
     )
 
 
-def _guidance_section(run: RunFolder, model: CausalGDP, transitions: Transitions | None) -> Section:
+def guidance_section(run: RunFolder, model: CausalGDP, transitions: Transitions | None) -> Section:
+    """
+    :param run: A run
+    :param model: Its model
+    :param transitions: On which it is computed
+    :return: How far the guidance moves the steps of the denoising chain
+    """
     title = "Guidance along the denoising chain"
     problems = run.problems_with("replay_buffer.npz", "replay_buffer.pkl")
     if transitions is None:
@@ -384,7 +455,7 @@ def _guidance_section(run: RunFolder, model: CausalGDP, transitions: Transitions
     observations = policy_input(model, _some(transitions.observations, GUIDANCE_OBSERVATIONS))
     figure = plot_guidance_strength(step_divergences(model.policy, observations).cpu())
     caption = "How far the guidance moves each step of the chain; the sum over the steps is TensorBoard's guidance/kl."
-    return Section(title, [f"From {transitions.source}.", *problems], [_picture(figure, caption)])
+    return Section(title, [f"From {transitions.source}.", *problems], [make_picture(figure, caption)])
 
 
 def _evaluation_section(played: Played, problem: str | None) -> Section:
@@ -441,7 +512,12 @@ def _command_section(run: RunFolder) -> Section:
 # Text and pictures ------------------------------------------------------------------------------------------------------
 
 
-def _picture(figure: Figure, caption: str) -> Picture:
+def make_picture(figure: Figure, caption: str) -> Picture:
+    """
+    :param figure: A figure
+    :param caption: What it shows
+    :return: The figure as a picture of a page
+    """
     data = io.BytesIO()
     figure.savefig(data, format="png", dpi=DPI)
     return Picture(caption, base64.b64encode(data.getvalue()).decode(), round(figure.get_figwidth() * 96))

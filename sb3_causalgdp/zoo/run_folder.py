@@ -4,7 +4,9 @@ import json
 import re
 import zipfile
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -151,10 +153,47 @@ class RunFolder:
         """
         graphs: dict[int, CausalGraph] = {}
         for _, path in self.checkpoints():
-            graph = self._attributes(path).get("_causal_graph")
+            graph = self._graph(path)
             if graph is not None and graph.num_timesteps is not None:
                 graphs[graph.num_timesteps] = graph
         return [graphs[steps] for steps in sorted(graphs)]
+
+    def newest_graph(self) -> CausalGraph | None:
+        """
+        :return: Of the causal graphs of all models, the one of the most steps; None if they have none
+        """
+        graphs = [graph for path in self.models().values() if (graph := self._graph(path)) is not None]
+        return max(graphs, key=lambda graph: graph.num_timesteps or 0, default=None)
+
+    def _graph(self, path: Path) -> CausalGraph | None:
+        try:
+            facts = path.stat()
+            return _saved_graph(path, facts.st_mtime_ns, facts.st_size, self.trusted)
+        except Exception as error:  # a damaged file can raise anything
+            self.note(path.name, error)
+            return None
+
+    # Progress -------------------------------------------------------------------------------------------------------------
+
+    @property
+    def wanted_steps(self) -> int | None:
+        """Environment steps that the training is to take, None if the run does not say."""
+        for settings in (self.arguments, self.entry or {}):
+            with suppress(TypeError, ValueError, OverflowError):
+                steps = int(float(settings.get("n_timesteps", -1)))
+                if steps > 0:
+                    return steps
+        return None
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether the model of the end of the training is there."""
+        return "final" in self.models()
+
+    @property
+    def changed_at(self) -> float:
+        """When one of its files was written last, in seconds since the epoch."""
+        return max(_changes_of(self.path), default=0.0)
 
     def _attributes(self, path: Path) -> dict[str, Any]:
         try:
@@ -236,6 +275,13 @@ def saved_attributes(path: Path, trusted: bool = False) -> dict[str, Any]:
         return {**known, **left_out, **read_plain(archive, CausalGDP._known_classes())}
 
 
+@lru_cache(maxsize=1_000)
+def _saved_graph(path: Path, written_at: int, size: int, trusted: bool) -> CausalGraph | None:
+    """The causal graph of a model; a file that was written at the same time and has the same size is the same."""
+    graph = saved_attributes(path, trusted).get("_causal_graph")
+    return graph if isinstance(graph, CausalGraph) else None
+
+
 def saved_versions(path: Path) -> dict[str, str]:
     """
     :param path: A saved model
@@ -265,6 +311,33 @@ def find_runs(folder: Path, trusted: bool = False) -> list[RunFolder]:
             candidate = (has_model, int(name["number"]), path.stat().st_mtime, path)
             latest[name["environment"]] = max(candidate, latest.get(name["environment"], candidate))
     return [RunFolder(path, trusted) for _, (*_, path) in sorted(latest.items())]
+
+
+def run_folders(folder: Path) -> list[Path]:
+    """
+    :param folder: The folder of a run, of an algorithm, or of several algorithms
+    :return: The folders of all runs in it, that which changed last first
+    """
+    if _is_run(folder):
+        return [folder]
+    below = _folders_in(folder)
+    found = [path for path in [*below, *(path for one in below for path in _folders_in(one))] if _is_run(path)]
+    return sorted(found, key=lambda path: (max(_changes_of(path), default=0.0), path.name), reverse=True)
+
+
+def _folders_in(folder: Path) -> list[Path]:
+    try:
+        return sorted(path for path in folder.iterdir() if path.is_dir())
+    except OSError:
+        return []
+
+
+def _changes_of(folder: Path) -> Iterator[float]:
+    """When each file of a run was written; one that is replaced meanwhile counts with the next look."""
+    for path in [*folder.glob("*"), *folder.glob("offline/*")]:
+        with suppress(OSError):
+            if path.is_file():
+                yield path.stat().st_mtime
 
 
 def _is_run(folder: Path) -> bool:

@@ -19,7 +19,7 @@ for module in ("mujoco", "moviepy", "pygame", "seaborn"):
 
 GUIDE = Path(__file__).parents[2] / "docs" / "guide" / "zoo.md"
 BLOCK = re.compile(r"^```bash\n(.*?)^```$", re.MULTILINE | re.DOTALL)
-ELSEWHERE = ("push_to_hub", "load_from_hub", "record_training")
+ELSEWHERE = ("push_to_hub", "load_from_hub", "record_training", "watch")
 LARGEST = {
     "train": {"-n": 100, "--eval-freq": 50, "--save-freq": 50, "--max-total-trials": 1, "--n-startup-trials": 1},
     "enjoy": {"-n": 20},

@@ -12,6 +12,7 @@ import zipfile
 from dataclasses import replace
 from pathlib import Path
 
+import chromium
 import numpy as np
 import pytest
 import yaml
@@ -172,6 +173,29 @@ def test_a_browser_shows_all_of_it_and_complains_of_nothing(full_page, tmp_path)
     assert facts["links"] == [True] * len(SECTIONS) and facts["visible"] == [True] * len(SECTIONS)
     assert facts["overflow"] <= 0 and facts["complaints"] == []
     assert np.asarray(Image.open(tmp_path / "page.png").convert("L")).std() > 5.0
+
+
+@pytest.mark.skipif(chromium.find() is None, reason="there is no Chromium")
+def test_chromium_shows_all_of_it_loads_nothing_and_complains_of_nothing(full_page, tmp_path):
+    with chromium.browser(tmp_path / "profile") as browser:
+        browser.open(full_page.path.as_uri())
+        text = browser.wait_for("CausalGDP on Pendulum-v1", *SECTIONS, "6 episodes", "opened (1): cos angle -> cos angle'")
+        assert browser.evaluate("document.title").startswith("CausalGDP on Pendulum-v1")
+        pictures = browser.evaluate(chromium.PICTURES)
+        assert len(pictures) == 6 and all(natural > 0 and 0 < shown <= 1200 for _, natural, shown in pictures)
+        assert browser.evaluate(chromium.OVERFLOW) <= 0
+        # What is folded opens with a click
+        names = ("cos angle", "sin angle", "vel angle", "torque")
+        assert "strongest of" in text and not any(f"{name} reward" in text for name in names)
+        browser.evaluate("document.querySelector('#causal-graph summary').click()")
+        browser.wait_for("cause effect mask strength", *names)
+        browser.screenshot(tmp_path / "page.png")
+        assert np.asarray(Image.open(tmp_path / "page.png").convert("L")).std() > 5.0
+        assert {request for request in browser.requests if not request.startswith("data:")} == {full_page.path.as_uri()}
+        assert browser.complaints == []
+        browser.open(full_page.path.as_uri(), width=400)
+        browser.wait_for(*SECTIONS)
+        assert browser.evaluate(chromium.OVERFLOW) <= 0
 
 
 def test_it_says_what_the_run_was(full_page):
