@@ -40,7 +40,8 @@ from sb3_causalgdp.offline.pretraining import callback_list
 from sb3_causalgdp.policies import CausalGDPPolicy, CnnPolicy, DiffusionActor, MlpPolicy, MultiInputPolicy
 from sb3_causalgdp.questions import AskedAlgorithm
 from sb3_causalgdp.saving.policies import with_first_defaults
-from sb3_causalgdp.updates import Losses, StepPlan, Updates, optimizer_of
+from sb3_causalgdp.step_plans import StepPlan, dealt
+from sb3_causalgdp.updates import Losses, Updates, optimizer_of
 
 SelfCausalGDP = TypeVar("SelfCausalGDP", bound="CausalGDP")
 
@@ -447,7 +448,7 @@ class CausalGDP(AskedAlgorithm, CheckedAlgorithm):
         beside_critics = updates.beside_critics()
         # The next actions are those at the end of the chain of the actor's moving average
         next_actions, for_critics = updates.bootstrap(replay_data)
-        for plan, batch in updates.dealt(plans, replay_data, one_step, next_actions, for_critics):
+        for plan, batch in dealt(plans, replay_data, one_step, next_actions, for_critics):
             of_step = updates.update_critics(batch.replay_data, batch.for_critics, plan.running_weight)
             if plan.trains_world_model:
                 with beside_critics():

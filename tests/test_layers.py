@@ -15,7 +15,7 @@ LAYERS = [
     {"saving.algorithm", "callbacks.pictures"},
     {"callbacks", "checkpoints", "knowledge"},
     {"callbacks.world_model", "updates"},
-    {"losses", "batches", "distillation", "callbacks.diagnostics", "questions", "acceleration.fast_steps"},
+    {"losses", "batches", "distillation", "callbacks.diagnostics", "questions", "acceleration.fast_steps", "step_plans"},
     {"policies", "acceleration.device_replay", "acceleration.cuda_graphs", "acceleration.gradients"},
     {"export", "abstraction"},
     {"steering"},

@@ -8,7 +8,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 
 from sb3_causalgdp import CausalGDP, CausalWorldModelCallback
-from sb3_causalgdp.updates import StepPlan
+from sb3_causalgdp.step_plans import StepPlan
 
 KWARGS = small(learning_starts=50, batch_size=16, train_freq=4, causal_refresh_freq=100)
 

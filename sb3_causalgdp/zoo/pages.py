@@ -5,7 +5,7 @@ from pathlib import Path
 
 import jinja2
 
-from sb3_causalgdp.zoo.report_sections import Section
+from sb3_causalgdp.zoo.parts import Section
 
 _TEMPLATES = jinja2.Environment(
     loader=jinja2.FileSystemLoader(Path(__file__).parent),

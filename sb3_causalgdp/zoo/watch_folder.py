@@ -10,19 +10,17 @@ from typing import Any
 
 from sb3_causalgdp.causal import CausalGraph
 from sb3_causalgdp.causal.description import count_of_edges
-from sb3_causalgdp.zoo.pages import section_html
-from sb3_causalgdp.zoo.report_sections import (
-    Section,
-    Table,
+from sb3_causalgdp.zoo.graph_sections import (
     edge_table,
     graph_changes,
     graph_pictures,
     graph_remarks,
-    guarded,
     history_section,
     known_graphs,
-    learning_section,
 )
+from sb3_causalgdp.zoo.pages import section_html
+from sb3_causalgdp.zoo.parts import Section, Table, guarded
+from sb3_causalgdp.zoo.report_sections import learning_section
 from sb3_causalgdp.zoo.run_folder import RunFolder, run_folders
 from sb3_causalgdp.zoo.watch_player import Player, Request
 

@@ -24,7 +24,7 @@ from PIL import Image
 
 from sb3_causalgdp import CausalGDP
 from sb3_causalgdp.causal import CausalGraph
-from sb3_causalgdp.zoo.report_sections import _graph_section
+from sb3_causalgdp.zoo.graph_sections import graph_section
 from sb3_causalgdp.zoo.run_folder import RunFolder, find_runs
 
 SECTIONS = [
@@ -470,7 +470,7 @@ def test_it_says_what_is_hidden_from_the_policy():
     graph = CausalGraph(model.transition_variables, masks, np.zeros_like(masks), method="by hand", n_samples=1000)
     model.set_causal_graph(graph)
     model.judge_relevance(graph)
-    section = _graph_section(model)
+    section = graph_section(model)
     assert "Hidden from actor and critics: cos angle, sin angle." in section.remarks
     shown = {row[0]: row[-1] for row in section.tables[-1].rows}
     assert shown == {"cos angle": "hidden", "sin angle": "hidden", "vel angle": "shown", "torque": "shown"}
