@@ -282,9 +282,7 @@ class GuidedScheduler:
         factor = factor.flatten()
         return gradient * factor, curvature * factor[:, None] * factor
 
-    def _of_all_actions(
-        self, gradient: th.Tensor, curvature: th.Tensor, shape: th.Size
-    ) -> tuple[th.Tensor, th.Tensor]:
+    def _of_all_actions(self, gradient: th.Tensor, curvature: th.Tensor, shape: th.Size) -> tuple[th.Tensor, th.Tensor]:
         """The same by all of a chunk, ``horizon * d`` components, of which most are 0 where it is about one action."""
         if not self._is_about_one(shape):
             return gradient, curvature
