@@ -559,12 +559,12 @@ class CausalGDP(AskedAlgorithm, SavedAlgorithm):
         :param gradient_steps: How many the perceptron is trained for
         :param batch_size: Observations for each
         :param learning_rate: Of its optimizer, falling to 0
-        :param env: Where the perceptron acts between rounds of training, not the environment that is learned from; observations
-            as that one has them, before ``VecNormalize``. None for no such rounds
+        :param env: Where the perceptron acts between rounds of training, not the environment that is learned from; its
+            observations as they are before ``VecNormalize``. None for no such rounds
         :param n_rounds: How many, each with half as many observations and gradient steps more
         :return: The policy, with ``predict`` and ``save``; this model goes on as before
-        :raises ValueError: If an argument is out of range, there are no transitions, the environment has other spaces or is the
-            one that is learned from, or the policy acts in one pass already
+        :raises ValueError: If an argument is out of range, there are no transitions, the environment has other spaces or is
+            the one that is learned from, or the policy acts in one pass already
         """
         check_arguments(DISTILLATION_ARGUMENTS, locals())
         if self.actor.one_pass is not None:

@@ -31,8 +31,8 @@ def distil(
     :param batch_size: Observations for each
     :param learning_rate: Of Adam, at the start
     :param visit: Batches of observations that a policy gets to by its own actions
-    :param n_rounds: How often the perceptron learns what the teacher does there, too, with half as many gradient steps (DAgger,
-        Ross et al., 2011, https://arxiv.org/abs/1011.0686)
+    :param n_rounds: How often the perceptron learns what the teacher does there, too, with half as many gradient steps
+        (DAgger, Ross et al., 2011, https://arxiv.org/abs/1011.0686)
     :return: A copy of the policy that acts by this perceptron
     """
     student = type(teacher)(**{**teacher._get_constructor_parameters(), "one_pass": True}).to(teacher.device)

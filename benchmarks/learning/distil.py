@@ -58,7 +58,7 @@ def main() -> None:
     parser.add_argument("--checkpoint", type=Path, help="of the teacher, as run.py writes them")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--episodes", type=int, default=30)
-    parser.add_argument("--students", type=json.loads, nargs="+", default=[{}], help="arguments of distil(), as JSON")
+    parser.add_argument("--students", type=json.loads, nargs="+", help="arguments of distil(), as JSON")
     given = parser.parse_args()
     th.set_num_threads(1)
     model = teacher_of(given)
@@ -66,7 +66,8 @@ def main() -> None:
     before = returns_of(model.policy, given.env, given.episodes)
     row = {"env": given.env, "policy": "teacher", "return": round(before.mean(), 1), "std": round(before.std(), 1)}
     print(json.dumps({**row, "random": round(random, 1)}), flush=True)
-    for arguments in given.students:
+    # With and without an environment in which the student acts
+    for arguments in given.students or [{}, {"env": given.env}]:
         start = time.process_time()
         student = model.distil(**arguments)
         seconds = time.process_time() - start

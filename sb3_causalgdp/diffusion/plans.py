@@ -173,9 +173,9 @@ def _euler_maruyama(points: Sequence[Point], eta: float) -> list[Stage]:
 
 def _start(points: Sequence[Point]) -> list[Stage]:
     """
-    Where an ODE begins. What was drawn is noise alone, but some of the action may be left at the last diffusion step, and an ODE,
-    unlike an SDE, keeps what is missing to its end. This is DDIM's step from no signal to what the schedule leaves, with the
-    clean estimate of the last diffusion step, which is that of no signal but for a share of alpha_bar.
+    Where an ODE begins. What was drawn is noise alone, but some of the action may be left at the last diffusion step, and an
+    ODE, unlike an SDE, does not forget what is missing. This is DDIM's step from no signal to what the schedule leaves, with
+    the clean estimate of the last diffusion step, which is that of no signal but for a share of alpha_bar.
     """
     noisiest = points[-1]
     if noisiest.signal <= LEAST_SIGNAL:
