@@ -8,9 +8,9 @@ seconds, and the pages need not know:
 - ``CausalGDP`` and others have smaller defaults (``SMALL``);
 - Minari's datasets that pages name are on disk, a few steps of their environments.
 
-A block below ``<!-- not executed: the reason -->`` is compiled, no more, and one below ``<!-- needs: package -->`` where that is
-missing. Of ``bash`` blocks, our own commands are parsed up to
-the point where they would begin to work, and make's targets must exist.
+A block below ``<!-- not executed: the reason -->`` is compiled, no more, and so is one below ``<!-- needs: package -->`` where
+that is missing. Of ``bash`` blocks, our own commands are parsed up to the point where they would begin to work, and make's
+targets must exist.
 """
 
 import argparse
