@@ -62,20 +62,23 @@ class ActionUnits(NamedTuple):
     def from_unnormalizer(cls, unnormalize: Callable[[th.Tensor], th.Tensor], n_actions: int) -> "ActionUnits":
         """
         Any function from the network's actions to the environment's that takes each component by itself, such as the
-        postprocessor of a LeRobot policy, whatever its normalisation is. It is asked for three actions.
+        postprocessor of a LeRobot policy, whatever its normalisation is. It is asked for four actions.
 
         :param unnormalize: From shape ``(batch, d)`` to the same shape
         :param n_actions: Number of action components d
         :return: The way back
         :raises ValueError: If it is not of the form ``scale * normalised + offset``
         """
+        normalised = th.tensor([-1.0, 0.0, 0.5, 1.0])[:, None].expand(-1, n_actions)
         with th.no_grad():
-            low, offset, high = (unnormalize(th.full((1, n_actions), value)).squeeze(0) for value in (-1.0, 0.0, 1.0))
-        scale = high - offset
-        if not th.allclose(offset - low, scale, rtol=1e-3, atol=1e-6) or bool((scale == 0.0).any()):
+            actions = unnormalize(normalised)
+        offset, scale = actions[1], actions[3] - actions[1]
+        # Of components near their offset, rounding is all that is left
+        difference = (scale * normalised + offset - actions).abs()
+        if bool((difference > 1e-3 * scale.abs() + 1e-5 * offset.abs()).any()) or bool((scale == 0.0).any()):
             raise ValueError(
-                "unnormalize must be scale * action + offset with a scale for each component, "
-                f"got {low.tolist()}, {offset.tolist()} and {high.tolist()} for actions of -1, 0 and 1"
+                "unnormalize must be scale * action + offset, component by component, "
+                f"got {actions.tolist()} for actions of -1, 0, 0.5 and 1"
             )
         return cls(scale, offset)
 
