@@ -238,8 +238,9 @@ DISTILLATION_ARGUMENTS: dict[str, Kind] = {
     "gradient_steps": STEPS,
     "batch_size": integer(1, MOST_GRADIENT_STEPS),
     "learning_rate": number(0.0, LARGEST_WEIGHT, above=True),
+    "n_rounds": integer(0, MOST_GRADIENT_STEPS),
 }
-"""Every argument of :meth:`~sb3_causalgdp.CausalGDP.distil`."""
+"""Every argument of :meth:`~sb3_causalgdp.CausalGDP.distil` but the environment."""
 
 POLICY_ARGUMENTS: dict[str, Kind] = {
     "observation_space": instance(spaces.Space, "a space of Gymnasium"),

@@ -6,7 +6,6 @@ from collections import defaultdict
 from collections.abc import Callable, Sequence
 from typing import Any, ClassVar, TypeVar
 
-import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
@@ -20,7 +19,6 @@ from sb3_causalgdp.acceleration.gradients import check_compile
 from sb3_causalgdp.arguments import (
     CONSTRUCTOR_ARGUMENTS,
     DIFFUSION_ARGUMENTS,
-    DISTILLATION_ARGUMENTS,
     GUIDANCE_ARGUMENTS,
     POLICY_ARGUMENTS,
     check_action_space,
@@ -33,7 +31,7 @@ from sb3_causalgdp.causal.world_model import MaskedWorldModel
 from sb3_causalgdp.checked import CheckedAlgorithm
 from sb3_causalgdp.checkpoints import begin_training
 from sb3_causalgdp.checkpoints.checkpoint import fresh_seed
-from sb3_causalgdp.distillation import distil
+from sb3_causalgdp.distilling import DistilledAlgorithm
 from sb3_causalgdp.divergence import check_losses
 from sb3_causalgdp.offline.preload import normalised_parts
 from sb3_causalgdp.offline.pretraining import callback_list
@@ -46,7 +44,7 @@ from sb3_causalgdp.updates import Losses, Updates, optimizer_of
 SelfCausalGDP = TypeVar("SelfCausalGDP", bound="CausalGDP")
 
 
-class CausalGDP(AskedAlgorithm, CheckedAlgorithm):
+class CausalGDP(AskedAlgorithm, DistilledAlgorithm, CheckedAlgorithm):
     """
     Causality-Guided Diffusion Policy (CausalGDP).
 
@@ -493,34 +491,6 @@ class CausalGDP(AskedAlgorithm, CheckedAlgorithm):
             reset_num_timesteps=reset_num_timesteps,
             progress_bar=progress_bar,
         )
-
-    def distil(
-        self, n_observations: int = 20_000, gradient_steps: int = 20_000, batch_size: int = 256, learning_rate: float = 1e-3
-    ) -> CausalGDPPolicy:
-        """
-        Make a policy that acts in one pass, for robots that must act at once: a perceptron that does what this model's
-        policy does without noise, guidance included, on the observations of the replay buffer and the preloaded transitions.
-
-        :param n_observations: Number of observations that the policy is asked for, drawn as batches are
-        :param gradient_steps: How many the perceptron is trained for
-        :param batch_size: Observations for each
-        :param learning_rate: Of its optimizer, falling to 0
-        :return: The policy, with ``predict`` and ``save``; this model goes on as before
-        :raises ValueError: If an argument is out of range, there are no transitions, or the policy acts in one pass already
-        """
-        check_arguments(DISTILLATION_ARGUMENTS, locals())
-        if self.actor.one_pass is not None:
-            raise ValueError("distil() needs a policy that denoises, got one that acts in one pass")
-        buffers = [buffer for buffer in (self.replay_buffer, self.offline_buffer) if buffer is not None]
-        if sum(buffer.size() for buffer in buffers) == 0:
-            raise ValueError("distil() needs transitions, got none: call learn(), preload() or load_replay_buffer()")
-        numpy_state, rows = np.random.get_state(), 500
-        with th.random.fork_rng():
-            counts = [min(rows, n_observations - first) for first in range(0, n_observations, rows)]
-            observations = [self._updates.batches.sample(count).observations for count in counts]
-            student = distil(self.policy, observations, gradient_steps, batch_size, learning_rate)
-        np.random.set_state(numpy_state)
-        return student
 
     def _excluded_save_params(self) -> list[str]:
         return super()._excluded_save_params() + [  # noqa: RUF005

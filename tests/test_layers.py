@@ -11,7 +11,7 @@ LAYERS = [
     {"zoo", "datasets"},
     {"__init__"},
     {"causalgdp"},
-    {"checked", "callbacks.own"},
+    {"checked", "callbacks.own", "distilling"},
     {"saving.algorithm", "callbacks.pictures"},
     {"callbacks", "checkpoints", "knowledge"},
     {"callbacks.world_model", "updates"},

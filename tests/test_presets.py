@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 import torch as th
 from small_models import small
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_causalgdp import CausalGDP, MlpPolicy, preset
 from sb3_causalgdp.acceleration.acting import OnePassActing
+from sb3_causalgdp.distillation import visited
 from sb3_causalgdp.presets import METHODS, OFFLINE, PRESETS
 
 KWARGS = small(learning_starts=210, causal_refresh_freq=205, batch_size=32, train_freq=1, n_action_candidates=4)
@@ -193,9 +195,57 @@ def test_a_distilled_policy_does_what_the_guided_one_does(teacher, tmp_path):
     np.testing.assert_array_equal(loaded.predict(observations, deterministic=True)[0], imitated)
 
 
+class Far(Aim):
+    """Where the replay buffer of the next test has never been."""
+
+    def reset(self, *, seed=None, options=None):
+        observation, info = super().reset(seed=seed)
+        return np.abs(observation), info
+
+    def step(self, action):
+        observation, *rest = super().step(action)
+        return np.abs(observation), *rest
+
+
+def test_a_distilled_policy_learns_where_it_gets_to_itself(teacher):
+    observations = teacher.replay_buffer.observations.copy()
+    teacher.replay_buffer.observations[:] = -np.abs(observations)
+    try:
+        arguments = {"n_observations": 500, "gradient_steps": 500}
+        students = [teacher.distil(**arguments), teacher.distil(**arguments, env=Far(), n_rounds=1)]
+    finally:
+        teacher.replay_buffer.observations[:] = observations
+    seen = np.random.default_rng(1).uniform(0.3, 1.0, (500, 2)).astype(np.float32)
+    actions, _ = teacher.predict(seen, deterministic=True)
+    errors = [np.abs(student.predict(seen, deterministic=True)[0] - actions).mean() for student in students]
+    assert errors[1] < 0.05 and errors[1] < 0.5 * errors[0], errors
+
+
+def test_an_environment_to_distil_in_is_one_of_its_own_with_the_models_spaces(teacher):
+    for own in (teacher.get_env(), teacher.get_env().envs[0], teacher.get_env().envs[0].unwrapped):
+        with pytest.raises(ValueError, match="must not be the environment that is learned from"):
+            teacher.distil(env=own)
+    with pytest.raises(ValueError, match="Observation spaces do not match"):
+        teacher.distil(env="Pendulum-v1")
+    with pytest.raises(ValueError, match="as they are, got one with VecNormalize"):
+        teacher.distil(env=VecNormalize(DummyVecEnv([Aim])))
+
+
+def test_observations_that_are_visited_are_normalised_as_those_learned_from():
+    env = VecNormalize(DummyVecEnv([Aim]))
+    model = CausalGDP("MlpPolicy", env, **KWARGS).learn(150)
+    before = env.obs_rms.mean.copy(), env.obs_rms.count
+    visits = visited(model.policy, DummyVecEnv([Aim]), 50, env)
+    assert len(visits) == 50 and np.array_equal(env.obs_rms.mean, before[0]) and env.obs_rms.count == before[1]
+    # Uniform numbers in [-1, 1] have a standard deviation of .58
+    assert float(th.cat(visits).std()) == pytest.approx(1.0, abs=0.25)
+    model.distil(50, 5, env=Aim(), n_rounds=1)
+    assert env.obs_rms.count == before[1]
+
+
 def test_distilling_leaves_the_model_as_it_was(teacher):
     before, buffers = vector(teacher.policy), (np.random.get_state()[1].copy(), th.random.get_rng_state())
-    teacher.distil(n_observations=600, gradient_steps=5)
+    teacher.distil(n_observations=600, gradient_steps=5, env=Aim())
     assert th.equal(vector(teacher.policy), before)
     assert np.array_equal(np.random.get_state()[1], buffers[0]) and th.equal(th.random.get_rng_state(), buffers[1])
 
@@ -221,5 +271,7 @@ def test_distilling_needs_a_policy_that_denoises_and_transitions(teacher):
         CausalGDP("MlpPolicy", Aim()).distil()
     with pytest.raises(ValueError, match="needs a policy that denoises"):
         CausalGDP("MlpPolicy", Aim(), **preset("dtql", **KWARGS)).distil()
+    with pytest.raises(ValueError, match=r"n_rounds must be an integer from 0 .*, got -1"):
+        teacher.distil(n_rounds=-1)
     with pytest.raises(ValueError, match=r"gradient_steps must be an integer from 1 .*, got 0"):
         teacher.distil(gradient_steps=0)

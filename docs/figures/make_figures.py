@@ -23,6 +23,7 @@ from PIL import Image
 from sb3_causalgdp.causal import CausalGraph, MaskedWorldModel, StructuralModel, TransitionVariables, discover
 from sb3_causalgdp.causal.plots import plot_heat_map
 from sb3_causalgdp.diffusion import NOISE_SCHEDULES, GuidanceRule, NoiseSchedule, sample
+from sb3_causalgdp.diffusion.plans import sampling_plan
 from sb3_causalgdp.losses import world_model_loss
 
 FOLDER = Path(__file__).parent
@@ -327,8 +328,8 @@ def draw_samplers() -> Figure:
     for index, (title, distance) in enumerate(panels.items()):
         axes = figure.add_subplot(1, 3, index + 1)
         for sampler, colour in SAMPLER_COLOURS.items():
-            # Heun asks the denoiser twice in all steps but the last
-            costs = [2 * n - 1 if sampler == "heun" else n for n in SAMPLER_STEPS]
+            name = title.rpartition(" ")[2]
+            costs = [len(sampling_plan(NoiseSchedule(name, n), sampler)) for n in SAMPLER_STEPS]
             axes.plot(
                 costs, [distance(n, sampler) for n in SAMPLER_STEPS], color=colour, marker="o", markersize=3, label=sampler
             )

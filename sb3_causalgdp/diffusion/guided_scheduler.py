@@ -58,6 +58,30 @@ class ActionUnits(NamedTuple):
         scale, offset = th.as_tensor(scale), th.as_tensor(offset)
         return cls(1.0 / scale, -offset / scale)
 
+    @classmethod
+    def from_unnormalizer(cls, unnormalize: Callable[[th.Tensor], th.Tensor], n_actions: int) -> "ActionUnits":
+        """
+        Any function from the network's actions to the environment's that takes each component by itself, such as the
+        postprocessor of a LeRobot policy, whatever its normalisation is. It is asked for four actions.
+
+        :param unnormalize: From shape ``(batch, d)`` to the same shape
+        :param n_actions: Number of action components d
+        :return: The way back
+        :raises ValueError: If it is not of the form ``scale * normalised + offset``
+        """
+        normalised = th.tensor([-1.0, 0.0, 0.5, 1.0])[:, None].expand(-1, n_actions)
+        with th.no_grad():
+            actions = unnormalize(normalised)
+        offset, scale = actions[1], actions[3] - actions[1]
+        # Of components near their offset, rounding is all that is left
+        difference = (scale * normalised + offset - actions).abs()
+        if bool((difference > 1e-3 * scale.abs() + 1e-5 * offset.abs()).any()) or bool((scale == 0.0).any()):
+            raise ValueError(
+                "unnormalize must be scale * action + offset, component by component, "
+                f"got {actions.tolist()} for actions of -1, 0, 0.5 and 1"
+            )
+        return cls(scale, offset)
+
 
 class NoiseLevel(NamedTuple):
     """
@@ -230,31 +254,45 @@ class GuidedScheduler:
         shape = sample.shape
         clean = self.clean_estimate(model_output, sample, level)
         gradient, curvature = self._local_model(clean if self.clip is None else clean.clamp(-self.clip, self.clip))
-        # At no signal at all a network says what it likes, and what it says does not depend on the sample
-        has_jacobian = self.rule.needs_jacobian and level.alpha_bar > LEAST_SIGNAL
         share = th.full((1, 1), max(level.alpha_bar, 1e-12), dtype=gradient.dtype, device=gradient.device)
-        rule = self.rule if has_jacobian or not self.rule.needs_jacobian else GuidanceRule("posterior", "unit_gaussian")
-        jacobian = level.norm * self._jacobian(timestep, sample, level) if has_jacobian else None
-        direction = rule(gradient, curvature, share, jacobian)
-        return (self.rule.scales[0] * (1.0 - share) / share.sqrt() * direction).reshape(shape)
+        strength = self.rule.scales[0] * (1.0 - share) / share.sqrt()
+        # At no signal at all a network says what it likes, and what it says does not depend on the sample
+        if self.rule.needs_jacobian and level.alpha_bar > LEAST_SIGNAL:
+            gradient, curvature = self._of_all_actions(gradient, curvature, shape)
+            jacobian = level.norm * self._jacobian(timestep, sample, level)
+            return (strength * self.rule(gradient, curvature, share, jacobian)).reshape(shape)
+        rule = GuidanceRule("posterior", "unit_gaussian") if self.rule.needs_jacobian else self.rule
+        # Without the network's Jacobian, the guided action is the only one that moves
+        shift = strength * rule(gradient, curvature, share)
+        if not self._is_about_one(shape):
+            return shift.reshape(shape)
+        whole = th.zeros(shape, dtype=shift.dtype, device=shift.device)
+        whole[:, self.position] = shift
+        return whole
+
+    def _is_about_one(self, shape: th.Size) -> bool:
+        """Whether the guidance is about one action of a chunk."""
+        return len(shape) == 3 and self.position is not None
 
     def _local_model(self, clean: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
-        """Gradient and curvature of the guidance in the network's units, of shapes ``(batch, m)`` and ``(batch, m, m)``."""
+        """Gradient and curvature of the guidance by what it is about, in the network's units."""
         assert self.guidance is not None
         scale, offset = (th.as_tensor(value, dtype=clean.dtype, device=clean.device) for value in self.units)
-        factor = scale.expand(clean.shape[1:])
-        actions = scale * clean + offset
-        if clean.ndim == 2 or self.position is None:
-            gradient, curvature = self.guidance(actions.flatten(1))
-            factor = factor.flatten()
-            return gradient * factor, curvature * factor[:, None] * factor
-        gradient, curvature = self.guidance(actions[:, self.position])
-        factor = factor[self.position]
-        whole_gradient = th.zeros_like(clean)
-        whole_gradient[:, self.position] = gradient * factor
-        batch, horizon, width = clean.shape
-        whole_curvature = clean.new_zeros(batch, horizon, width, horizon, width)
-        whole_curvature[:, self.position, :, self.position] = curvature * factor[:, None] * factor
+        factor, actions = scale.expand(clean.shape[1:]), scale * clean + offset
+        if self._is_about_one(clean.shape):
+            factor, actions = factor[self.position], actions[:, self.position]
+        gradient, curvature = self.guidance(actions.flatten(1))
+        factor = factor.flatten()
+        return gradient * factor, curvature * factor[:, None] * factor
+
+    def _of_all_actions(self, gradient: th.Tensor, curvature: th.Tensor, shape: th.Size) -> tuple[th.Tensor, th.Tensor]:
+        """The same by all of a chunk, ``horizon * d`` components, of which most are 0 where it is about one action."""
+        if not self._is_about_one(shape):
+            return gradient, curvature
+        batch, horizon, width = shape
+        whole_gradient, whole_curvature = gradient.new_zeros(shape), curvature.new_zeros(batch, horizon, width, horizon, width)
+        whole_gradient[:, self.position] = gradient
+        whole_curvature[:, self.position, :, self.position] = curvature
         return whole_gradient.flatten(1), whole_curvature.reshape(batch, horizon * width, horizon * width)
 
     def _jacobian(self, timestep: Any, sample: th.Tensor, level: NoiseLevel) -> th.Tensor:

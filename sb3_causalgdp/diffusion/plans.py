@@ -27,7 +27,7 @@ class Stage(NamedTuple):
     :param by_previous_noisy: Weight of the noisy action of the stage before
     :param std: Standard deviation of the noise
     :param is_last: Whether this is the last stage
-    :param corrects: Whether the stage mends the step of the one before it, as in Heun's method
+    :param corrects: Whether the stage is no step along the grid: it mends the one before it, as in Heun's method, or the start
     """
 
     point: int
@@ -172,6 +172,18 @@ def _euler_maruyama(points: Sequence[Point], eta: float) -> list[Stage]:
     return stages
 
 
+def _start(points: Sequence[Point]) -> list[Stage]:
+    """
+    Where an ODE begins. What was drawn is noise alone, but some of the action may be left at the last diffusion step, and an
+    ODE, unlike an SDE, does not forget what is missing. This is DDIM's step from no signal to what the schedule leaves, with
+    the clean estimate of the last diffusion step, which is that of no signal but for a share of alpha_bar.
+    """
+    noisiest = points[-1]
+    if noisiest.signal <= LEAST_SIGNAL:
+        return []
+    return [Stage(*noisiest, by_clean=noisiest.signal, by_noisy=noisiest.spread, corrects=True)]
+
+
 def _heun(points: Sequence[Point], eta: float) -> list[Stage]:
     """
     The probability-flow ODE. For ``x = a / signal`` and ``sigma = spread / signal`` it is ``dx / dsigma = eps`` (Karras et
@@ -221,6 +233,8 @@ SAMPLERS: dict[str, Callable[[Sequence[Point], float], list[Stage]]] = {
     "dpm_solver": _dpm_solver,
 }
 STOCHASTIC_SAMPLERS = ("ddpm", "euler_maruyama")
+# Share of the action's size at the noise end up to which it does not matter that a start of pure noise has none of it
+LEAST_SIGNAL = 0.01
 SPACINGS = ("time", "log_snr")
 
 
@@ -244,12 +258,15 @@ def sampling_plan(
     :param sampler: One of :data:`SAMPLERS`
     :param eta: Noise of DDIM: 0 is deterministic, 1 is DDPM
     :param n_steps: Number of the sampler's steps, None for K; ``heun`` evaluates the denoiser twice in all of them but the
-        last
+        last, and those without noise once more for their start where the schedule leaves more than 1 % of the action
     :param spacing: ``time`` or ``log_snr``, see :func:`sampling_points`
     :return: The evaluations of the denoiser, from noise to the action
     """
     key = sampler, eta, n_steps, spacing
     if key not in schedule.plans:
         points = sampling_points(schedule, n_steps, spacing)
-        schedule.plans[key] = [*SAMPLERS[sampler](points, eta), Stage(*points[0], is_last=True)]
+        stages = SAMPLERS[sampler](points, eta)
+        draws_noise = sampler in STOCHASTIC_SAMPLERS or any(stage.std > 0.0 for stage in stages)
+        start = [] if draws_noise else _start(points)
+        schedule.plans[key] = [*start, *stages, Stage(*points[0], is_last=True)]
     return schedule.plans[key]

@@ -210,6 +210,41 @@ def test_the_guidance_sees_the_units_of_the_environment(name):
     assert float((ends * th.tensor(scale) + th.tensor(offset) - wished).abs().max()) < 0.1
 
 
+@pytest.mark.parametrize("name", UNITS)
+def test_units_are_read_off_any_unnormaliser(name):
+    units = UNITS[name][0]
+    read = ActionUnits.from_unnormalizer(lambda action: units.scale * action + units.offset, n_actions=2)
+    th.testing.assert_close((read.scale, read.offset), (units.scale, units.offset))
+    for wrong in (th.tanh, lambda action: 0.0 * action):
+        with pytest.raises(ValueError, match=r"must be scale \* action \+ offset, .* got .* for actions of -1, 0, 0.5 and 1"):
+            ActionUnits.from_unnormalizer(wrong, n_actions=2)
+
+
+@pytest.mark.parametrize("mode", ["posterior", "score", "normalized"])
+def test_a_guidance_about_one_action_leaves_the_others_where_they_are(mode):
+    """What a guidance of the whole chunk that knows of one action alone gives: the small system is the large one's."""
+    generator = th.Generator().manual_seed(0)
+    output, sample = th.randn(2, 5, 4, 3, generator=generator)
+    root = th.randn(3, 3, generator=generator)
+
+    def about_one(action):
+        return (0.3 - action) @ (root @ root.T), (root @ root.T).expand(len(action), 3, 3)
+
+    def about_all(actions):
+        gradient, curvature = about_one(actions[:, 6:9])
+        whole_gradient, whole_curvature = th.zeros(5, 12), th.zeros(5, 12, 12)
+        whole_gradient[:, 6:9], whole_curvature[:, 6:9, 6:9] = gradient, curvature
+        return whole_gradient, whole_curvature
+
+    shifts = []
+    for guidance, position in ((about_one, 2), (about_all, None)):
+        guided = GuidedScheduler(scheduler_of("DDIMScheduler", "sample"), guidance, GuidanceRule(mode), position=position)
+        timestep = guided.timesteps[10]
+        shifts.append(guided.shift(output, timestep, sample, guided.noise_level(timestep)))
+    assert float(shifts[0][:, 2].abs().min()) > 0.0
+    th.testing.assert_close(*shifts)
+
+
 def test_all_else_is_the_schedulers():
     scheduler = scheduler_of("DDPMScheduler")
     guided = GuidedScheduler(scheduler)

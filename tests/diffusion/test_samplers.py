@@ -4,6 +4,7 @@ import pytest
 import torch as th
 
 from sb3_causalgdp.diffusion import MLPDenoiser, NoiseSchedule, sample
+from sb3_causalgdp.diffusion.plans import sampling_plan
 from sb3_causalgdp.diffusion.samplers import denoising_step, transition_std
 
 STEPPING = {"timestep_spacing": "leading", "steps_offset": 0, "prediction_type": "epsilon"}
@@ -50,13 +51,15 @@ def mean_and_covariance(denoiser, schedule, mean, **kwargs):
     """
     Of the samples, exactly: with a linear denoiser a sample is ``b + A z`` in its noise z, read off one unit vector at a time.
 
-    The chain starts where the forward process ends on average, about what is left of the prior's mean.
+    The chain starts where the forward process ends on average, about what is left of the prior's mean, if it does not find its
+    start by itself.
     """
     dim = len(mean)
     n_noises = schedule.n_steps * dim
     noise = th.cat([th.zeros(1, n_noises, dtype=th.float64), th.eye(n_noises, dtype=th.float64)])
     noise = noise.view(n_noises + 1, schedule.n_steps, dim).transpose(0, 1).clone()
-    noise[0] += math.sqrt(schedule.alpha_bar_list[-1]) * mean
+    if not sampling_plan(schedule, **kwargs)[0].corrects:
+        noise[0] += math.sqrt(schedule.alpha_bar_list[-1]) * mean
     condition = th.zeros(n_noises + 1, 1, dtype=th.float64)
     samples = sample(denoiser, schedule, condition, noise=noise, clip=None, **kwargs)
     columns = samples[1:] - samples[0]
@@ -117,6 +120,12 @@ def test_whole_chain_is_that_of_diffusers(sampler, eta, clip):
     th.manual_seed(0)
     condition, noise = th.randn(16, 2), th.randn(6, 16, 2)
     action = noise[0]
+    start = sampling_plan(schedule, sampler, eta)[0]
+    assert start.corrects == (sampler == "ddim" and eta == 0.0)
+    if start.corrects:
+        # What they start from is a^K, which holds 8 % of the action
+        clean = clean_estimate(schedule, 5, action, wavy(action, 5, condition), clip)
+        action = schedule.add_noise(clean, action, th.full((16,), 5))
     for position, step in enumerate(scheduler.timesteps.tolist()):
         # The chain's last step draws no noise
         fresh = noise[position + 1] if step > 0 else th.zeros(16, 2)
@@ -133,7 +142,8 @@ def test_exact_denoiser_of_a_gaussian_gives_that_gaussian(name, sampler, eta, pr
     mean, covariance = prior
     schedule = NoiseSchedule(name, 200)
     ours = mean_and_covariance(gaussian_denoiser(schedule, mean, covariance), schedule, mean, sampler=sampler, eta=eta)
-    th.testing.assert_close(ours[0], mean, rtol=0.0, atol=1e-9)
+    finds_start = sampling_plan(schedule, sampler, eta)[0].corrects
+    th.testing.assert_close(ours[0], mean, rtol=0.0, atol=3e-3 if finds_start else 1e-9)
     assert (ours[1] - covariance).norm() < 0.1 * covariance.norm()
 
 
@@ -144,7 +154,7 @@ def test_mean_of_a_gaussian_is_right_at_few_steps_and_more_steps_mend_the_covari
     for n_steps in (5, 20, 80):
         schedule = NoiseSchedule("vp", n_steps)
         ours = mean_and_covariance(gaussian_denoiser(schedule, mean, covariance), schedule, mean, sampler=sampler)
-        th.testing.assert_close(ours[0], mean, rtol=0.0, atol=1e-9)
+        th.testing.assert_close(ours[0], mean, rtol=0.0, atol=3e-3 if sampler == "ddim" else 1e-9)
         errors.append(float((ours[1] - covariance).norm() / covariance.norm()))
     assert errors[0] > errors[1] > errors[2]
 
@@ -236,7 +246,7 @@ def test_clip_bounds_the_actions_and_none_does_not():
 
 @pytest.mark.parametrize("sampler", ["ddpm", "ddim"])
 def test_one_step_returns_the_clean_estimate(sampler):
-    schedule, noise = NoiseSchedule("vp", 1), th.randn(1, 8, 2, generator=th.Generator().manual_seed(0))
+    schedule, noise = NoiseSchedule("linear", 1), th.randn(1, 8, 2, generator=th.Generator().manual_seed(0))
     condition = th.zeros(8, 2)
     expected = clean_estimate(schedule, 0, noise[0], wavy(noise[0], 0, condition), 1.0)
     th.testing.assert_close(sample(wavy, schedule, condition, noise=noise, sampler=sampler), expected)

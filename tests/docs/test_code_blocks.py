@@ -8,8 +8,9 @@ seconds, and the pages need not know:
 - ``CausalGDP`` and others have smaller defaults (``SMALL``);
 - Minari's datasets that pages name are on disk, a few steps of their environments.
 
-A block below ``<!-- not executed: the reason -->`` is compiled, no more. Of ``bash`` blocks, our own commands are parsed up to
-the point where they would begin to work, and make's targets must exist.
+A block below ``<!-- not executed: the reason -->`` is compiled, no more, and so is one below ``<!-- needs: package -->`` where
+that is missing. Of ``bash`` blocks, our own commands are parsed up to the point where they would begin to work, and make's
+targets must exist.
 """
 
 import argparse
@@ -54,6 +55,7 @@ ANY_FENCE = re.compile(r"^ *(?:```|~~~)(.*)\n(?:.*\n)*?^ *(?:```|~~~)$", re.MULT
 # Outputs, citations, pages of Sphinx, and YAML, which tests/zoo/test_hyperparameters.py makes models of
 OTHER_BLOCKS = re.compile(r"|text|bibtex|yaml|\{[\w-]+\}.*")
 NOT_EXECUTED = re.compile(r"<!-- not executed: (.+?) -->\s*\Z")
+NEEDS = re.compile(r"<!-- needs: (\w+) -->\s*\Z")
 MOST_NOT_EXECUTED = 0
 
 LIMITS = (
@@ -92,14 +94,19 @@ class Block:
     code: str
     line: int  # of the page, on which the code begins
     reason: str | None  # why it is not executed
+    needs: str | None  # package without which it is not executed
+
+    @property
+    def is_executed(self):
+        return self.reason is None and (self.needs is None or importlib.util.find_spec(self.needs) is not None)
 
 
 def blocks_of(page):
     text = page.read_text(encoding="utf-8")
     for match in FENCE.finditer(text):
-        marker = NOT_EXECUTED.search(text[: match.start()])
+        marker, needed = (pattern.search(text[: match.start()]) for pattern in (NOT_EXECUTED, NEEDS))
         line = text.count("\n", 0, match.start(2)) + 1
-        yield Block(match[1], match[2], line, marker and marker[1])
+        yield Block(match[1], match[2], line, marker and marker[1], needed and needed[1])
 
 
 def name_of(page):
@@ -204,7 +211,7 @@ def test_python_blocks_run(page, small_budgets, datasets, tmp_path, monkeypatch)
     for block in blocks_of(page):
         if block.language == "python":
             code = compiled(block, page)
-            if block.reason is None:
+            if block.is_executed:
                 exec(code, namespace)
 
 
@@ -304,3 +311,9 @@ def test_stand_ins_are_small(datasets, monkeypatch):
         name: minari.load_dataset(name).total_steps for name in ("D4RL/pointmaze/umaze-v2", "sb3_causalgdp/maze2d-umaze-v0")
     }
     assert np.all(np.array([*sizes.values()]) < 1_000), sizes
+
+
+def test_a_block_that_needs_a_package_is_run_where_that_is_installed(tmp_path):
+    page = tmp_path / "page.md"
+    page.write_text("".join(f"<!-- needs: {name} -->\n```python\n1\n```\n\n" for name in ("numpy", "no_such_package")))
+    assert [block.is_executed for block in blocks_of(page)] == [True, False]
