@@ -19,7 +19,7 @@ from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from stable_baselines3.common.vec_env import VecNormalize
 from torch import nn
 
-from sb3_causalgdp.abstraction import forget_inputs, forget_outputs
+from sb3_causalgdp.abstraction import forget_inputs, forget_outputs, forget_rows
 from sb3_causalgdp.acceleration.acting import NumpyActing, OnePassActing
 from sb3_causalgdp.acceleration.activations import fast
 from sb3_causalgdp.arguments import POLICY_ARGUMENTS, check_arguments, check_keywords
@@ -347,7 +347,7 @@ class CausalGDPPolicy(SavedPolicy):
         """
         Say what actor, critics and their targets see. Hidden components of observations are constant for them. Hidden ones of
         actions are 0 in all that the actor gives and the critics are asked, before the exploration noise. What is shown again
-        starts with weights of 0, so that no output jumps. The world model sees everything always.
+        starts with weights of 0, so that no output jumps. The world model leaves out next values that are hidden.
 
         :param states: Which state variables are shown, boolean, shape ``(n,)``
         :param actions: Which components of the actions are shown, boolean, shape ``(d,)``
@@ -364,6 +364,9 @@ class CausalGDPPolicy(SavedPolicy):
         self.state_gate.copy_(states)
         self.action_gate.copy_(actions)
         self._write_action_gates()
+        known, newly = self.world_model.modelled_states, self.world_model.model_only(states)
+        optimizer: Any = self.world_model.optimizer
+        forget_rows(self.world_model.transition.parameters(), newly, known, optimizer)
         if self.normalize_observations:
             self.update_observation_statistics()
         else:
@@ -426,6 +429,7 @@ class CausalGDPPolicy(SavedPolicy):
                 state_dict = {**open_gates, **state_dict}
             result = super().load_state_dict(state_dict, strict, assign)
             self._write_action_gates()
+            self.world_model.model_only(self.state_gate > 0.0)
             return result
         of_states, of_actions = state_dict.pop("state_gate", None), state_dict.pop("action_gate", None)
         result = super().load_state_dict(state_dict, strict, assign)
@@ -593,7 +597,7 @@ class CausalGDPPolicy(SavedPolicy):
         :param action: The best candidate, shape ``(batch, d)``
         :return: The guidance for these states
         """
-        response = self.world_model.action_response(state, action)
+        response = self.world_model.action_response(state, action, of_all=False)
         next_state = response.next_state
         next_action = action
         if self.guidance_target == "return" and not self.has_image_state:
