@@ -335,6 +335,7 @@ CONSTRUCTOR_ARGUMENTS: dict[str, Kind] = {
     "causal_window": integer(8, MOST_STEPS) | NONE,
     "sample_masks": FLAG,
     "causal_abstraction": FLAG | KEYWORDS,
+    "counterfactual_replay": SHARE,
     "state_names": NAMES | NONE,
     "action_names": NAMES | NONE,
     "offline_dataset": PATH | NONE,

@@ -133,6 +133,9 @@ class CausalGDP(AskedAlgorithm, SavedAlgorithm):
         training, and model only such actions; others are the middle of their range plus exploration noise. A dictionary holds
         arguments of :class:`~sb3_causalgdp.causal.RelevanceGate`, and ``keep_open``, a list of names of states and actions
         that are never hidden
+    :param counterfactual_replay: Share of a batch, from 0 to 1, whose transitions exchange what does not influence each other
+        by the graphs of the training: whole components, or what is independent at these states (CoDA,
+        https://arxiv.org/abs/2007.02863). Nothing is exchanged before two graphs in a row can be trusted
     :param state_names: Names of the observation's components in graphs, pictures and answers; None takes the environment's own
         (see :func:`~sb3_causalgdp.names.found_names`), or where it has none keys and indices
     :param action_names: The same for the components of the actions
@@ -236,6 +239,7 @@ class CausalGDP(AskedAlgorithm, SavedAlgorithm):
         causal_window: int | None = None,
         sample_masks: bool = True,
         causal_abstraction: bool | dict[str, Any] = False,
+        counterfactual_replay: float = 0.0,
         state_names: Sequence[str] | None = None,
         action_names: Sequence[str] | None = None,
         offline_dataset: str | None = None,
@@ -325,6 +329,7 @@ class CausalGDP(AskedAlgorithm, SavedAlgorithm):
         self.causal_window = causal_window
         self.sample_masks = sample_masks
         self.causal_abstraction = causal_abstraction
+        self.counterfactual_replay = counterfactual_replay
         self.state_names = state_names
         self.action_names = action_names
         self.compile = compile
@@ -397,6 +402,11 @@ class CausalGDP(AskedAlgorithm, SavedAlgorithm):
             raise ValueError(f"buffer_size must be at least 2 n_envs with optimize_memory_usage, got {self.buffer_size}")
         buffer_class = self.replay_buffer_class or (ReplayBuffer if self.n_steps == 1 else NStepReplayBuffer)
         check_keywords("replay_buffer_kwargs", self.replay_buffer_kwargs, buffer_class)
+        if self.counterfactual_replay > 0.0 and issubclass(buffer_class, NStepReplayBuffer):
+            raise ValueError(
+                f"counterfactual_replay must be 0 with returns of several steps, got {self.counterfactual_replay}: what "
+                "happened between is not known of exchanged transitions"
+            )
 
     def _own_policy_kwargs(self) -> dict[str, Any]:
         names = (
@@ -621,6 +631,7 @@ class CausalGDP(AskedAlgorithm, SavedAlgorithm):
             "_resumed_at_gradient_step",
             "causal_graph_history",
             "relevance_gate",
+            "trusted_components",
         ]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:

@@ -15,7 +15,7 @@ LAYERS = [
     {"callbacks", "checkpoints", "knowledge"},
     {"callbacks.world_model", "updates"},
     {"losses", "batches", "distillation", "callbacks.diagnostics", "questions", "acceleration.fast_steps"},
-    {"policies", "acceleration.device_replay", "acceleration.cuda_graphs", "acceleration.gradients"},
+    {"policies", "counterfactual", "acceleration.device_replay", "acceleration.cuda_graphs", "acceleration.gradients"},
     {"export"},
     {"prediction", "acceleration.product_pass"},
     {"networks", "acceleration.acting"},
