@@ -134,7 +134,7 @@ class CounterfactualReplay:
         if normalizer is not None:
             observations = normalizer.unnormalize_obs(observations)
         goals = (observations["achieved_goal"], observations["desired_goal"])
-        infos = [{} for _ in range(len(next_states))]
+        infos: list[dict[str, Any]] = [{} for _ in range(len(next_states))]
         rewards = model.replay_buffer.env.env_method("compute_reward", *goals, infos, indices=[0])[0]
         rewards = model.replay_buffer._normalize_reward(np.asarray(rewards, dtype=np.float32).reshape(-1, 1), normalizer)
         return th.as_tensor(rewards, device=next_states.device).flatten()
@@ -155,10 +155,8 @@ class CounterfactualReplay:
 
     def _written(self, sample: Any, parts: list[tuple[th.Tensor, Exchange]]) -> Any:
         rows = th.cat([part[exchange.exchanged] for part, exchange in parts])
-        states, actions, next_states, rewards = (
-            th.cat([values[exchange.exchanged] for values, (_, exchange) in zip(column, parts, strict=True)])
-            for column in zip(*(exchange.transitions for _, exchange in parts), strict=True)
-        )
+        kept = [Transitions(*(values[one.exchanged] for values in one.transitions)) for _, one in parts]
+        states, actions, next_states, rewards = (th.cat(list(column)) for column in zip(*kept, strict=True))
         return sample._replace(
             observations=_with_rows(sample.observations, rows, self._observations(states)),
             actions=_with_rows(sample.actions, rows, actions),

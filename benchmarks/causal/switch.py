@@ -1,13 +1,12 @@
 """
 How soon the graph follows a world that changes: edges that go and come when an action loses its effect or a sensor dies.
 
-    OMP_NUM_THREADS=1 python benchmarks/causal/switch.py --windows 10000 0 --seeds 0 1 2
+    OMP_NUM_THREADS=1 python benchmarks/causal/switch.py --windows 10000 5000 0 --seeds 0 1 2
 
 Uniform actions; the change comes at ``--at-step``, a graph is found every ``--every`` steps from the newest ``--windows``
 transitions (0 keeps all). ``action``: an action has no effect any more. ``sensor``: a sensor shows zero. ``distractor``: an
-idle action begins to move what another one moved. Two numbers for each: steps from the change until the graph has followed,
-an edge being a mask above 0.5, and stays so, and the area of wrong masks meanwhile, in steps. ``never``: not in
-``--after`` steps.
+idle action begins to move what another one moved. For the edges that go, and for those that come: steps from the change
+until all of them have followed, an edge being a mask above 0.5, and stay so. ``never``: not in ``--after`` steps.
 """
 
 import argparse
@@ -100,7 +99,7 @@ def edges_that_change(graph: CausalGraph, change: str) -> tuple[np.ndarray, np.n
 
 def follow(
     rows: np.ndarray, variables: TransitionVariables, at_step: int, every: int, window: int, change: str
-) -> tuple[int | None, float, int]:
+) -> dict[str, Any]:
     """
     :param rows: Transitions
     :param variables: Theirs
@@ -108,29 +107,38 @@ def follow(
     :param every: Rows between graphs
     :param window: Newest rows from which a graph is found, 0 for all
     :param change: One of ``CHANGES``
-    :return: steps until the graph followed for good, None for never; wrong masks, summed over the steps; edges that change
+    :return: number of edges that go and that come, and steps until they did for good
     """
     discovery = make_discovery("partial_r2")
     statistics: Any = make_statistics(discovery, variables, None, window or None)
-    graph, wrong = None, []
+    graph, wrong = None, []  # numbers of edges that have not gone, and not come
     for end in range(every, len(rows) + 1, every):
         statistics.update(rows[end - every : end])
         graph = discovery(statistics, variables, graph)
         if end == at_step:
             gone, come = edges_that_change(graph, change)
         elif end > at_step:
-            wrong.append((graph.masks[gone] > 0.5).sum() + (graph.masks[come] <= 0.5).sum())
+            wrong.append(((graph.masks[gone] > 0.5).sum(), (graph.masks[come] <= 0.5).sum()))
+    left, right = np.transpose(wrong)
+    return {
+        "edges_gone": int(gone.sum()),
+        "steps_gone": _followed_after(left, every),
+        "edges_come": int(come.sum()),
+        "steps_come": _followed_after(right, every) if come.any() else "",
+    }
+
+
+def _followed_after(wrong: np.ndarray, every: int) -> int | str:
     still_wrong = np.flatnonzero(wrong)
-    n_wrong = 0 if len(still_wrong) == 0 else int(still_wrong[-1]) + 1
-    steps = None if n_wrong == len(wrong) else every * (n_wrong + 1)
-    return steps, float(every * np.mean(wrong)), int(gone.sum() + come.sum())
+    n_graphs = 0 if len(still_wrong) == 0 else int(still_wrong[-1]) + 1
+    return "never" if n_graphs == len(wrong) else every * (n_graphs + 1)
 
 
 def main(argv: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--env", default="HalfCheetah-v5")
     parser.add_argument("--changes", nargs="+", choices=CHANGES, default=list(CHANGES))
-    parser.add_argument("--windows", nargs="+", type=int, default=[10_000, 0])
+    parser.add_argument("--windows", nargs="+", type=int, default=[10_000, 5_000, 0])
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
     parser.add_argument("--at-step", type=int, default=15_000)
     parser.add_argument("--after", type=int, default=15_000)
@@ -143,18 +151,9 @@ def main(argv: Sequence[str] | None = None) -> None:
             env = make(arguments.env, change, arguments.at_step)
             rows, variables = collect(env, arguments.at_step + arguments.after, seed)
             for window in arguments.windows:
-                steps, area, n_edges = follow(rows, variables, arguments.at_step, arguments.every, window, change)
-                records.append(
-                    {
-                        "environment": arguments.env,
-                        "change": change,
-                        "window": window,
-                        "seed": seed,
-                        "edges": n_edges,
-                        "steps": "never" if steps is None else steps,
-                        "mean_wrong_edges": round(area / arguments.every, 2),
-                    }
-                )
+                found = follow(rows, variables, arguments.at_step, arguments.every, window, change)
+                about = {"environment": arguments.env, "change": change, "window": window, "seed": seed}
+                records.append({**about, **found})
                 print(*(f"{key} {value}" for key, value in records[-1].items()), flush=True)
     if arguments.output is not None:
         with arguments.output.open("w", newline="") as stream:
