@@ -8,7 +8,7 @@ from torch import nn
 
 from sb3_causalgdp.diffusion import MLPDenoiser
 from sb3_causalgdp.extractors import StandardizedExtractor
-from sb3_causalgdp.forgetting import forget_inputs, forget_outputs
+from sb3_causalgdp.forgetting import forget_inputs, forget_outputs, forget_rows
 from sb3_causalgdp.networks import Critic, DiffusionActor
 from sb3_causalgdp.steering import SteeredPolicy
 
@@ -45,7 +45,7 @@ class AbstractingPolicy(SteeredPolicy):
         """
         Say what actor, critics and their targets see. Hidden components of observations are constant for them. Hidden ones of
         actions are 0 in all that the actor gives and the critics are asked, before the exploration noise. What is shown again
-        starts with weights of 0, so that no output jumps. The world model sees everything always.
+        starts with weights of 0, so that no output jumps. The world model leaves out next values that are hidden.
 
         :param states: Which state variables are shown, boolean, shape ``(n,)``
         :param actions: Which components of the actions are shown, boolean, shape ``(d,)``
@@ -62,6 +62,9 @@ class AbstractingPolicy(SteeredPolicy):
         self.state_gate.copy_(states)
         self.action_gate.copy_(actions)
         self._write_action_gates()
+        known, newly = self.world_model.modelled_states, self.world_model.model_only(states)
+        optimizer: Any = self.world_model.optimizer
+        forget_rows(self.world_model.transition.parameters(), newly, known, optimizer)
         if self.normalize_observations:
             self.update_observation_statistics()
         else:
@@ -124,6 +127,7 @@ class AbstractingPolicy(SteeredPolicy):
                 state_dict = {**open_gates, **state_dict}
             result = super().load_state_dict(state_dict, strict, assign)
             self._write_action_gates()
+            self.world_model.model_only(self.state_gate > 0.0)
             return result
         of_states, of_actions = state_dict.pop("state_gate", None), state_dict.pop("action_gate", None)
         result = super().load_state_dict(state_dict, strict, assign)

@@ -217,6 +217,7 @@ GROUPS: dict[str, dict[str, Kind]] = {
         "causal_refresh_freq": STEPS,
         "sample_masks": FLAG,
         "causal_abstraction": FLAG | KEYWORDS,
+        "counterfactual_replay": SHARE,
         "causal_half_life": number(1.0, LARGEST_NUMBER) | NONE,
         "causal_window": integer(8, MOST_STEPS) | NONE,
         "state_names": NAMES | NONE,

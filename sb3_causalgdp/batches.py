@@ -7,6 +7,7 @@ import numpy as np
 from stable_baselines3.common.buffers import ReplayBuffer
 
 from sb3_causalgdp.acceleration.device_replay import DeviceReplay
+from sb3_causalgdp.counterfactual import CounterfactualReplay
 from sb3_causalgdp.offline.replay import concatenate_samples, deal_rows, rows_of
 
 Model = Any  # a CausalGDP, whose file imports this one
@@ -23,6 +24,7 @@ class Batches:
 
     def __init__(self, model: Model) -> None:
         self.model = model
+        self.counterfactual = CounterfactualReplay(model)
         self._on_device: dict[str, tuple[ReplayBuffer, DeviceReplay | None]] = {}
 
     def up_to_actor_updates(self, gradient_steps: int, batch_size: int) -> Iterator[tuple[int, Any]]:
@@ -38,7 +40,8 @@ class Batches:
         most_at_once = 1 if model.policy.has_image_state else max(1, self.MOST_ROWS_PER_DRAW // batch_size)
         for first in range(0, gradient_steps, most_at_once):
             n_left = min(most_at_once, gradient_steps - first)
-            drawn, begin = deal_rows(self.sample(n_left * batch_size), n_left), 0
+            sample = self.counterfactual.exchanged(self.sample(n_left * batch_size))
+            drawn, begin = deal_rows(sample, n_left), 0
             while n_left > 0:
                 n_steps = min(model.policy_delay - model._n_updates % model.policy_delay, n_left)
                 end = begin + n_steps * batch_size

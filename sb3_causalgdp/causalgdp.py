@@ -131,6 +131,9 @@ class CausalGDP(AskedAlgorithm, DistilledAlgorithm, CheckedAlgorithm):
         training, and model only such actions; others are the middle of their range plus exploration noise. A dictionary holds
         arguments of :class:`~sb3_causalgdp.causal.RelevanceGate`, and ``keep_open``, a list of names of states and actions
         that are never hidden
+    :param counterfactual_replay: Share of a batch, from 0 to 1, whose transitions exchange what does not influence each other
+        by the graphs of the training: whole components, or what is independent at these states (CoDA,
+        https://arxiv.org/abs/2007.02863). Nothing is exchanged before two graphs in a row can be trusted
     :param state_names: Names of the observation's components in graphs, pictures and answers; None takes the environment's own
         (see :func:`~sb3_causalgdp.names.found_names`), or where it has none keys and indices
     :param action_names: The same for the components of the actions
@@ -232,6 +235,7 @@ class CausalGDP(AskedAlgorithm, DistilledAlgorithm, CheckedAlgorithm):
         causal_window: int | None = None,
         sample_masks: bool = True,
         causal_abstraction: bool | dict[str, Any] = False,
+        counterfactual_replay: float = 0.0,
         state_names: Sequence[str] | None = None,
         action_names: Sequence[str] | None = None,
         offline_dataset: str | None = None,
@@ -321,6 +325,7 @@ class CausalGDP(AskedAlgorithm, DistilledAlgorithm, CheckedAlgorithm):
         self.causal_window = causal_window
         self.sample_masks = sample_masks
         self.causal_abstraction = causal_abstraction
+        self.counterfactual_replay = counterfactual_replay
         self.state_names = state_names
         self.action_names = action_names
         self.compile = compile
@@ -506,6 +511,7 @@ class CausalGDP(AskedAlgorithm, DistilledAlgorithm, CheckedAlgorithm):
             "_resumed_at_gradient_step",
             "causal_graph_history",
             "relevance_gate",
+            "trusted_components",
         ]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:

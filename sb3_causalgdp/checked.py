@@ -19,6 +19,7 @@ class CheckedAlgorithm(SavedAlgorithm):
 
     actor_update: str
     expectile: float | None
+    counterfactual_replay: float
 
     def _check_together(self) -> None:
         """Arguments that are right alone, and not with the others."""
@@ -37,6 +38,11 @@ class CheckedAlgorithm(SavedAlgorithm):
             raise ValueError(f"buffer_size must be at least 2 n_envs with optimize_memory_usage, got {self.buffer_size}")
         buffer_class = self.replay_buffer_class or (ReplayBuffer if self.n_steps == 1 else NStepReplayBuffer)
         check_keywords("replay_buffer_kwargs", self.replay_buffer_kwargs, buffer_class)
+        if self.counterfactual_replay > 0.0 and issubclass(buffer_class, NStepReplayBuffer):
+            raise ValueError(
+                f"counterfactual_replay must be 0 with returns of several steps, got {self.counterfactual_replay}: what "
+                "happened between is not known of exchanged transitions"
+            )
 
     def _setup_learn(
         self,

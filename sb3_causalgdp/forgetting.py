@@ -56,6 +56,29 @@ def forget_outputs(layer: nn.Linear, rows: th.Tensor, optimizer: th.optim.Optimi
             moment[1][rows] = 0.0
 
 
+def forget_rows(
+    parameters: Iterable[th.Tensor], rows: th.Tensor, known: th.Tensor, optimizer: th.optim.Optimizer | None
+) -> None:
+    """
+    Let networks that lie in rows of common parameters, and were not trained for a while, go on with what they know and a
+    memory of gradients like that of the others, and not one that has died away.
+
+    :param parameters: Those of shape ``(rows * a, ...)`` hold ``a`` entries for each network
+    :param rows: Which networks go on, boolean, shape ``(rows,)``
+    :param known: Which were trained, boolean, shape ``(rows,)``
+    :param optimizer: Of the parameters, None if there is none
+    """
+    if not bool(rows.any()):
+        return
+    for parameter in parameters:
+        for name, moment in _moments(optimizer, parameter):
+            of_rows = moment.view(len(rows), -1)
+            others: float | th.Tensor = 0.0
+            if name.endswith(SECOND_MOMENTS) and bool(known.any()):
+                others = of_rows[known].mean()
+            of_rows[rows] = others
+
+
 def _forget_moments(optimizer: th.optim.Optimizer | None, parameter: th.Tensor, columns: th.Tensor, known: th.Tensor) -> None:
     for name, moment in _moments(optimizer, parameter):
         others: float | th.Tensor = 0.0

@@ -10,6 +10,7 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from sb3_causalgdp.arguments import check_keywords
 from sb3_causalgdp.causal import (
@@ -22,7 +23,9 @@ from sb3_causalgdp.causal import (
     make_statistics,
 )
 from sb3_causalgdp.causal.endings import with_endings
+from sb3_causalgdp.causal.trusted_components import TrustedComponents
 from sb3_causalgdp.causal.world_model import MaskedWorldModel
+from sb3_causalgdp.counterfactual import check_exchangeable
 from sb3_causalgdp.names import found_names
 from sb3_causalgdp.offline.algorithm import OfflineToOnlineAlgorithm
 from sb3_causalgdp.policies import CausalGDPPolicy, DiffusionActor
@@ -52,6 +55,9 @@ class DiscoveringAlgorithm(OfflineToOnlineAlgorithm):
     causal_abstraction: bool | dict[str, Any]
     relevance_gate: RelevanceGate | None
     """The verdict on what actor and critics see; None without ``causal_abstraction``."""
+    counterfactual_replay: float
+    trusted_components: TrustedComponents
+    """What transitions may exchange, judged where ``counterfactual_replay`` is above 0."""
     _updates: Updates
 
     GRAPHS_IN_HISTORY = 32
@@ -64,6 +70,7 @@ class DiscoveringAlgorithm(OfflineToOnlineAlgorithm):
         self._causal_graph: CausalGraph | None = None
         self.causal_graph_history: list[CausalGraph] = []
         self._relevance_verdict: dict[str, Any] | None = None
+        self._exchangeable: dict[str, Any] | None = None
         self._steps_since_refresh = 0
         # Positions of the replay buffer that were ever written, and how many of them the statistics have seen
         self._stored_position = 0
@@ -129,6 +136,27 @@ class DiscoveringAlgorithm(OfflineToOnlineAlgorithm):
         self.policy.show(th.as_tensor(verdict.states), th.as_tensor(verdict.actions))
         return verdict
 
+    def judge_components(self, graph: CausalGraph, ends: np.ndarray | None = None) -> str:
+        """
+        Judge by a new graph what transitions may exchange.
+
+        :param graph: On this model's variables
+        :param ends: Which states are known to end episodes, boolean, shape ``(n,)``
+        :return: Why nothing may be exchanged by this graph, empty if it is trusted
+        """
+        untrusted = self.trusted_components.update(graph, ends, isinstance(self.replay_buffer, HerReplayBuffer))
+        self._exchangeable = self.trusted_components.state_dict()
+        return untrusted
+
+    def _setup_exchange(self) -> None:
+        self.trusted_components = TrustedComponents(self.transition_variables)
+        if self.counterfactual_replay == 0.0:
+            self._exchangeable = None
+            return
+        check_exchangeable(self.policy)
+        if self._exchangeable is not None:
+            self.trusted_components.load_state_dict(self._exchangeable)
+
     def _never_hidden(self) -> list[str]:
         names, indices = self.transition_variables, self._indices
         kept = list(self._abstraction_options()[1])
@@ -182,6 +210,7 @@ class DiscoveringAlgorithm(OfflineToOnlineAlgorithm):
             raise ValueError(f"causal_discovery_kwargs: {error}") from error
         self.transition_variables = self._named_variables()
         self._setup_abstraction()
+        self._setup_exchange()
         method = self.causal_discovery
         # A callable that was saved is not the same object when it is loaded
         name = method if isinstance(method, str) else getattr(method, "__qualname__", type(method).__qualname__)

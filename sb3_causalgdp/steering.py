@@ -175,7 +175,7 @@ class SteeredPolicy(SavedPolicy):
         :param action: The best candidate, shape ``(batch, d)``
         :return: The guidance for these states
         """
-        response = self.world_model.action_response(state, action)
+        response = self.world_model.action_response(state, action, of_all=False)
         next_state = response.next_state
         next_action = action
         if self.guidance_target != "reward" and not self.has_image_state:

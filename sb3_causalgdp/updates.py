@@ -100,7 +100,7 @@ class Updates:
         weights = (model.eta, model.denoising_weight, model.bound_penalty, model.q_scale)
         of_methods = (model.expectile, model.advantage_temperature, model.improvement_step)
         rates = (model.tau, model.gamma, model.max_grad_norm, model.target_policy_noise, model.target_noise_clip)
-        scales = (self.policy.state_guidance_scale, self.policy.outcome_guidance_scale)
+        scales = (self.policy.state_guidance_scale, self.policy.outcome_guidance_scale, self.world_model.n_modelled)
         with n_threads_at_most(model.torch_threads, self.policy.has_image_state):
             yield self.fast.made_fast(gradient_steps, (weights, of_methods, rates, scales))
 

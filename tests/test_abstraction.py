@@ -312,6 +312,75 @@ def test_an_action_that_is_shown_again_is_learned():
     assert model.predict(np.zeros(N_STATES), deterministic=True)[0][2] != 0.0
 
 
+# The world model ------------------------------------------------------------------------------------------------------------
+
+
+class WideCart(gym.ObservationWrapper):
+    """With 20 further noises."""
+
+    def __init__(self, env):
+        super().__init__(env)
+        self.observation_space = spaces.Box(-np.inf, np.inf, (N_STATES + 20,), np.float64)
+
+    def observation(self, observation):
+        return np.array([*observation, *self.np_random.normal(size=20)])
+
+
+ENVIRONMENTS["wide"] = lambda: WideCart(Cart())
+
+
+def hide_noises(model):
+    hide(model, list(range(N_STATES, N_STATES + 20)), [])
+
+
+def test_next_values_of_hidden_states_cost_nothing_and_go_on_when_they_are_shown_again():
+    model = make("wide").learn(60)
+    world_model = model.world_model
+    hide_noises(model)
+    modelled = world_model.modelled_states
+    assert modelled.tolist() == [True] * 8 + [False] * 17  # a multiple of 8
+    output_weight = world_model.transition.output_weight
+    # What is left of the optimizer's momentum is over soon
+    model.train(100, 8)
+    before = output_weight.clone()
+    model.train(20, 8)
+    moved = (output_weight - before).abs().amax(dim=1)
+    assert moved[modelled].min() > 1e-4 and moved[~modelled].max() < 1e-6
+    hide(model, [], [])
+    assert world_model.modelled_states.all()
+    squares = model.world_model.optimizer.state[output_weight]["exp_avg_sq"]
+    assert squares[~modelled].min() > 0.1 * squares[modelled].mean()
+    model.train(20, 8)
+    assert (output_weight - before).abs().amax(dim=1)[~modelled].min() > 1e-4
+
+
+@pytest.mark.parametrize("target", ["return", "reward"])
+def test_guidance_of_what_is_shown_is_the_same_in_numpy_and_in_torch(target, monkeypatch):
+    model = make("wide", guidance_target=target, n_action_candidates=2).learn(60)
+    model.set_causal_graph(CausalGraph.fully_connected(model.transition_variables))
+    rows = np.random.default_rng(0).normal(size=(3, N_STATES + 20))
+    of_all = model.predict(rows, deterministic=True)[0]
+    hide_noises(model)
+    assert model.policy.is_guided and model.world_model.modelled_indices is not None
+    in_numpy = model.predict(rows, deterministic=True)[0]
+    assert model.policy._acting is not None and not np.allclose(in_numpy, of_all, atol=1e-4)
+    monkeypatch.setattr(switch, "is_on", lambda: False)
+    model.policy._acting = None
+    in_torch = model.predict(rows, deterministic=True)[0]
+    assert model.policy._acting is None
+    np.testing.assert_allclose(in_numpy, in_torch, atol=1e-5)
+
+
+def test_a_loaded_model_models_what_it_shows():
+    model = make("wide").learn(60)
+    hide_noises(model)
+    stream = io.BytesIO()
+    model.save(stream)
+    loaded = CausalGDP.load(stream, env=ENVIRONMENTS["wide"](), device="cpu")
+    assert th.equal(loaded.world_model.modelled_states, model.world_model.modelled_states)
+    assert CausalGDP.load(stream, device="cpu", causal_abstraction=False).world_model.modelled_states.all()
+
+
 # What decides ----------------------------------------------------------------------------------------------------------------
 
 

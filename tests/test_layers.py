@@ -16,7 +16,7 @@ LAYERS = [
     {"callbacks", "checkpoints", "knowledge"},
     {"callbacks.world_model", "updates"},
     {"losses", "batches", "distillation", "callbacks.diagnostics", "questions", "acceleration.fast_steps", "step_plans"},
-    {"policies", "acceleration.device_replay", "acceleration.cuda_graphs", "acceleration.gradients"},
+    {"policies", "counterfactual", "acceleration.device_replay", "acceleration.cuda_graphs", "acceleration.gradients"},
     {"export", "abstraction"},
     {"steering"},
     {"prediction", "acceleration.product_pass"},

@@ -75,8 +75,8 @@ def responses(
     model.set_masks(th.ones(n, n), mask * th.ones(n, d), th.ones(n), th.ones(d))
     found = []
     for _ in trained(model, arrays, updates, sample_masks):
-        tested = (arrays[name][:TESTED] for name in ("observations", "actions"))
-        jacobian = model.action_response(*tested).next_state_jacobian[:, VELOCITIES]
+        observations, actions = (arrays[name][:TESTED] for name in ("observations", "actions"))
+        jacobian = model.action_response(observations, actions).next_state_jacobian[:, VELOCITIES]
         found.append(float(jacobian.diagonal(dim1=1, dim2=2).mean()))
     return found
 

@@ -26,7 +26,7 @@ from sb3_causalgdp.acceleration.numpy_layers import (
     without_batch_norms,
     without_norms,
 )
-from sb3_causalgdp.acceleration.numpy_networks import Critics, Denoiser, Features, Rule, WorldModel
+from sb3_causalgdp.acceleration.numpy_networks import EVERY, Critics, Denoiser, Features, Rule, WorldModel
 from sb3_causalgdp.diffusion import MLPDenoiser
 from sb3_causalgdp.diffusion.plans import sampling_points
 from sb3_causalgdp.extractors import StandardizedExtractor
@@ -65,7 +65,9 @@ class HostCopy:
         """
         tensors = [tensor for module in _networks_of(policy) for tensor in (*module.parameters(), *module.buffers())]
         gates = [] if policy.actor.action_gate is None else [policy.actor.action_gate]
-        return [*tensors, policy.return_std, policy.reward_target, *gates]
+        # Which states are modelled is known here
+        floating = [tensor for tensor in tensors if tensor.is_floating_point()]
+        return [*floating, policy.return_std, policy.reward_target, *gates]
 
     @th.no_grad()
     def refresh(self) -> None:
@@ -190,11 +192,14 @@ class NumpyActing(_Views):
         self, policy: Policy, state: np.ndarray, action: np.ndarray, time_part: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """Gradient and curvature of the guidance at the best candidate, whose predicted state is the one to reach."""
-        response = self.world_model.response(state, action)
+        modelled = policy.world_model.modelled_indices
+        of = EVERY if modelled is None else modelled
+        response = self.world_model.response(state, action, of)
         by_next_state, by_action = response["reward_by_next_state"], response["reward_by_action"]
         if policy.guidance_target == "return":
             error, std = ONE, self.return_std
-            by_next_state = by_next_state + np.float32(policy.discount) * self._value_gradient(response, action, time_part)
+            by_value = self._value_gradient(response, action, time_part)[:, of]
+            by_next_state = by_next_state + np.float32(policy.discount) * by_value
         else:
             reward, std = self.world_model.reward_distribution(response["standardised_reward"])
             error = ((self.reward_target - reward) / std)[:, None]

@@ -1,5 +1,6 @@
 """The networks of a policy, its chain of denoising and its guidance, in numpy, on the memory of PyTorch's tensors."""
 
+import copy
 from collections.abc import Callable, Sequence
 from functools import reduce
 from typing import Any, NamedTuple
@@ -28,6 +29,9 @@ from sb3_causalgdp.diffusion.plans import Point, Stage, sampling_plan, sampling_
 from sb3_causalgdp.extractors import StandardizedExtractor
 
 Policy = Any  # a CausalGDPPolicy, whose file imports this one
+Indices = np.ndarray | slice
+
+EVERY = slice(None)
 _SMALLEST_RESIDUAL_STD, _MOST_CHANGE = constant(1e-4), constant(4.0)  # those of MaskedWorldModel
 
 
@@ -289,6 +293,18 @@ class _Blocks:
         ]
         self.output_weight, self.output_bias = view(blocks.output_weight), view(blocks.output_bias)
 
+    def of(self, outputs: Indices, inputs: Indices) -> "_Blocks":
+        """The chosen blocks, which see the chosen inputs alone."""
+        if outputs is EVERY and inputs is EVERY:
+            return self
+        chosen = copy.copy(self)
+        chosen.weight = self.weight[outputs][:, :, inputs]
+        chosen.bias, chosen.output_weight, chosen.output_bias = (
+            values[outputs] for values in (self.bias, self.output_weight, self.output_bias)
+        )
+        chosen.hidden = [(weight[outputs], bias[outputs]) for weight, bias in self.hidden]
+        return chosen
+
     def forward_and_jacobian(self, inputs: np.ndarray, mask: np.ndarray, first: int) -> tuple[np.ndarray, np.ndarray]:
         """Outputs, shape ``(batch, m)``, and their Jacobian by the inputs from the first on, shape ``(m, batch, q)``."""
         layers = [np.tanh((inputs * mask[:, None]) @ self.weight.transpose(0, 2, 1) + self.bias)]
@@ -302,44 +318,55 @@ class _Blocks:
 
 
 class WorldModel:
-    """:meth:`~sb3_causalgdp.causal.MaskedWorldModel.action_response`."""
+    """:meth:`~sb3_causalgdp.causal.MaskedWorldModel.action_response`, about the states that are modelled."""
 
     def __init__(self, model: MaskedWorldModel) -> None:
-        self.model = model
         self.transition, self.reward = _Blocks(model.transition), _Blocks(model.reward)
         self.input_bounds = constant(-model.INPUT_BOUND), constant(model.INPUT_BOUND)
         lowest, highest = model.LOG_STD_BOUNDS
         self.log_std_bounds = constant(lowest), constant(highest)
-        self.arrays = {
-            name: view(value) for name, value in (*model.named_buffers(recurse=False), *model.named_parameters(recurse=False))
-        }
+        named = (*model.named_buffers(recurse=False), *model.named_parameters(recurse=False))
+        self.arrays = {name: view(value) for name, value in named if value.is_floating_point()}
+        # What has a row for each state
+        self.of_states = [
+            name for name in self.arrays if name.startswith(("state_", "change_", "transition_")) or name.endswith("_to_state")
+        ]
 
-    def response(self, state: np.ndarray, action: np.ndarray) -> dict[str, np.ndarray]:
-        arrays = self.arrays
-        n_states = state.shape[1]
+    def response(self, state: np.ndarray, action: np.ndarray, of: Indices = EVERY) -> dict[str, np.ndarray]:
+        """The states that it is about, m of them, are given by their indices."""
+        inputs_of, arrays = of, self.arrays
+        if not isinstance(of, slice):
+            inputs_of = np.concatenate([of, np.arange(state.shape[1], state.shape[1] + action.shape[1])])
+            arrays = {**arrays, **{name: arrays[name][of] for name in self.of_states}}
+            arrays["state_to_state"] = arrays["state_to_state"][:, of]
+        now = state[:, of]
         state_std, reward_scale = np.sqrt(arrays["state_unit_square"]), np.sqrt(arrays["reward_unit_square"])
         gate = arrays["state_to_state"].diagonal()
         closed = ONE - gate
         change = np.minimum(arrays["change_variance"] / (state_std * state_std), _MOST_CHANGE)
         residual_std = np.maximum(np.sqrt(closed * closed + gate * change), _SMALLEST_RESIDUAL_STD)
-        standardised = (state - arrays["state_mean"]) / state_std
+        standardised = (now - arrays["state_mean"]) / state_std
         inputs = np.concatenate([clip(standardised, *self.input_bounds), action], axis=1)
         mask = np.concatenate([arrays["state_to_state"], arrays["action_to_state"]], axis=1)
-        change, jacobian = self.transition.forward_and_jacobian(inputs, mask, n_states)
+        change, jacobian = self.transition.of(of, inputs_of).forward_and_jacobian(inputs, mask, now.shape[1])
         next_standardised = gate * standardised + residual_std * change
         noise_std = np.exp(clip(arrays["transition_log_std"], *self.log_std_bounds))
         reward_inputs = np.concatenate([clip(next_standardised, *self.input_bounds), action], axis=1)
         reward_mask = np.concatenate([arrays["state_to_reward"], arrays["action_to_reward"]])[None]
-        reward, reward_gradient = self.reward.forward_and_jacobian(reward_inputs, reward_mask, 0)
+        reward, reward_gradient = self.reward.of(EVERY, inputs_of).forward_and_jacobian(reward_inputs, reward_mask, 0)
         reward_gradient = reward_scale * reward_gradient[0]
         within = np.abs(next_standardised) <= self.input_bounds[1]
+        next_state = arrays["state_mean"] + state_std * next_standardised
+        if not isinstance(of, slice):
+            modelled, next_state = next_state, state.copy()
+            next_state[:, of] = modelled
         return {
-            "next_state": arrays["state_mean"] + state_std * next_standardised,
+            "next_state": next_state,
             "next_state_std": noise_std * residual_std * state_std,
             "standardised_jacobian": (jacobian / noise_std[:, None, None]).transpose(1, 0, 2),
             "standardised_reward": reward[:, 0],
-            "reward_by_next_state": reward_gradient[:, :n_states] * within / state_std,
-            "reward_by_action": reward_gradient[:, n_states:],
+            "reward_by_next_state": reward_gradient[:, : now.shape[1]] * within / state_std,
+            "reward_by_action": reward_gradient[:, now.shape[1] :],
         }
 
     def reward_distribution(self, standardised: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

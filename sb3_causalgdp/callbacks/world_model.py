@@ -104,8 +104,12 @@ class CausalWorldModelCallback(BaseCallback):
         graph = model.discovery(statistics, variables, model._causal_graph)
         graph = replace(graph, num_timesteps=int(model.n_environment_steps))
         model.set_causal_graph(graph)
-        if model.relevance_gate is not None:
-            self._report_verdict(model.judge_relevance(graph, self._states_that_end()))
+        is_asked = model.relevance_gate is not None, model.counterfactual_replay > 0.0
+        ends = self._states_that_end() if any(is_asked) else None
+        if is_asked[0]:
+            self._report_verdict(model.judge_relevance(graph, ends))
+        if is_asked[1]:
+            self._report_components(model.judge_components(graph, ends))
         self.logger.record("causal/n_edges", graph.n_edges)
         self.logger.record("causal/expected_edges", graph.expected_edges)
         self.logger.record("causal/change", graph.change_since(before))
@@ -141,6 +145,12 @@ class CausalWorldModelCallback(BaseCallback):
             changes = [("hides", verdict.closed), ("shows", verdict.opened)]
             words = [f"{verb} {', '.join(names)}" for verb, names in changes if names]
             print("Causal abstraction: " + ("; ".join(words) or verdict.withheld or "as before"))
+
+    def _report_components(self, untrusted: str) -> None:
+        components = self.model.trusted_components.components
+        self.logger.record("causal/n_components", 0 if components is None else len(components.read))
+        if self.verbose >= 1 and untrusted:
+            print(f"Counterfactual replay waits: {untrusted}")
 
     def _say_too_few(self, n_samples: int, needed: int) -> None:
         if not self._said_too_few:

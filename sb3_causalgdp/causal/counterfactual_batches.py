@@ -199,6 +199,8 @@ def exchange_locally(
     binding: float = BINDING,
     keep: th.Tensor | None = None,
     generator: th.Generator | None = None,
+    reward_model: RewardModel | None = None,
+    read: th.Tensor | None = None,
 ) -> Exchange:
     """
     Exchange what is independent at these transitions, where the graph of all of them is connected: objects that do not touch.
@@ -214,6 +216,8 @@ def exchange_locally(
     :param binding: As in :func:`components_of`
     :param keep: As in :func:`exchange_part`
     :param generator: Random numbers, None for torch's own
+    :param reward_model: Computes rewards, None for the world model
+    :param read: Which states and actions the reward reads, boolean, shape (n + d,); None for what the graph says
     :return: the batch after the exchange
     :raises ValueError: when ``threshold`` is not positive
     """
@@ -229,13 +233,14 @@ def exchange_locally(
     part &= ~part.all(dim=1, keepdim=True)
     cut_off = _is_cut_off(adjacency, part)
     part &= (cut_off & cut_off[partners]).unsqueeze(1)
-    read = th.as_tensor(_edges(graph)[-1] >= binding, device=device)
+    if read is None:
+        read = th.as_tensor(_edges(graph)[-1] >= binding, device=device)
 
-    def reward_model(next_states: th.Tensor, actions: th.Tensor) -> th.Tensor:
+    def by_world_model(next_states: th.Tensor, actions: th.Tensor) -> th.Tensor:
         with th.no_grad():
             return world_model.predict_reward(next_states, actions)[0]
 
-    proposed = exchange_part(transitions, part, partners, read, reward_model, keep)
+    proposed = exchange_part(transitions, part, partners, read, reward_model or by_world_model, keep)
     after = local_edges(world_model, proposed.transitions.states, proposed.transitions.actions, threshold)
     accepted = _is_cut_off(after, part) & proposed.exchanged
     accepted &= accepted[partners]

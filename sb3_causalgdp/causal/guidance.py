@@ -15,7 +15,7 @@ class OutcomeTerm(NamedTuple):
     error: th.Tensor
     """(target - prediction) / std, shape ``(batch,)``."""
     by_next_state: th.Tensor
-    """Partial derivative of the prediction by the next state / std, shape ``(batch, n)``."""
+    """Partial derivative of the prediction by the next state / std, shape ``(batch, m)``, of what the response is about."""
     by_action: th.Tensor
     """Partial derivative of the prediction by the action, the next state as it is, / std, shape ``(batch, d)``."""
 
@@ -64,7 +64,8 @@ class ReturnTarget:
         self.std = std
 
     def __call__(self, response: ActionResponse) -> OutcomeTerm:
-        by_next_state = response.reward_by_next_state + self.discount * self.value_gradient(response.next_state)
+        value_gradient = response.states.outputs(self.value_gradient(response.next_state), 1)
+        by_next_state = response.reward_by_next_state + self.discount * value_gradient
         return OutcomeTerm(th.ones_like(response.reward), by_next_state / self.std, response.reward_by_action / self.std)
 
 
@@ -151,7 +152,7 @@ class CausalGuidance:
         """
         # Not as a decorator, which cannot be compiled for an object that is made inside the graph
         with th.no_grad():
-            return self.at(self.world_model.action_response(self.state, action))
+            return self.at(self.world_model.action_response(self.state, action, of_all=False))
 
     def at(self, response: ActionResponse) -> tuple[th.Tensor, th.Tensor]:
         """
@@ -159,7 +160,8 @@ class CausalGuidance:
         :return: As for a call with these actions
         """
         outcome = self.outcome(response)
-        by_error = (self.next_state - response.next_state) / response.next_state_std.square()
+        error = response.states.outputs(self.next_state - response.next_state, 1)
+        by_error = error / response.next_state_std.square()
         through, to_next_state = response.through_next_state(outcome.by_next_state, by_error).unbind(dim=1)
         jacobian = outcome.by_action + through
         gradient = self.outcome_scale * outcome.error.unsqueeze(1) * jacobian

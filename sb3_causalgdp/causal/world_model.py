@@ -3,6 +3,7 @@
 import math
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch as th
 from torch import nn
 
@@ -11,6 +12,48 @@ from sb3_causalgdp.acceleration.products import linear
 
 SMALLEST_STD = 1e-12
 ROUNDINGS = 8.0 * th.finfo(th.float32).eps
+
+
+WeightAndBias = tuple[th.Tensor, th.Tensor]
+
+
+class Chosen(NamedTuple):
+    """Some of the outputs and inputs of masked blocks, by their indices; None stands for all."""
+
+    output_indices: th.Tensor | None = None
+    input_indices: th.Tensor | None = None
+
+    def outputs(self, values: th.Tensor, dim: int = 0) -> th.Tensor:
+        """
+        :param values: One for each output along a dimension
+        :param dim: Which
+        :return: Those of the chosen outputs
+        """
+        return values if self.output_indices is None else values.index_select(dim, self.output_indices)
+
+    def inputs(self, values: th.Tensor, dim: int) -> th.Tensor:
+        """
+        :param values: One for each input along a dimension
+        :param dim: Which
+        :return: Those of the chosen inputs
+        """
+        return values if self.input_indices is None else values.index_select(dim, self.input_indices)
+
+
+ALL = Chosen()
+
+
+class _BlockLayers(NamedTuple):
+    input_weight: th.Tensor
+    """Times the mask, shape ``(m, w, p)``."""
+    input_bias: th.Tensor
+    """Shape ``(m, w)``."""
+    hidden: list[WeightAndBias]
+    """Of shapes ``(m, w, w)`` and ``(m, 1, w)``."""
+    output_weight: th.Tensor
+    """Shape ``(m, w)``."""
+    output_bias: th.Tensor
+    """Shape ``(m,)``."""
 
 
 class MaskedBlocks(nn.Module):
@@ -42,54 +85,64 @@ class MaskedBlocks(nn.Module):
         self.output_weight = nn.Parameter(th.empty(n_outputs, width).uniform_(-bound, bound))
         self.output_bias = nn.Parameter(th.zeros(n_outputs))
 
-    def _masked_input_weight(self, mask: th.Tensor) -> th.Tensor:
-        """Shape ``(m, w, p)``."""
-        return self.input_layer.weight.view(self.n_outputs, self.width, -1) * mask.unsqueeze(1)
+    def _layers(self, mask: th.Tensor, chosen: Chosen) -> _BlockLayers:
+        """Of the chosen blocks, with the mask in the weights of the chosen inputs."""
+        weight, bias = self.input_layer.weight.view(self.n_outputs, self.width, -1), self.input_layer.bias
+        return _BlockLayers(
+            chosen.inputs(chosen.outputs(weight), 2) * mask.unsqueeze(1),
+            chosen.outputs(bias.view(self.n_outputs, self.width)),
+            [(chosen.outputs(w), chosen.outputs(b)) for w, b in zip(self.hidden_weights, self.hidden_biases, strict=True)],
+            chosen.outputs(self.output_weight),
+            chosen.outputs(self.output_bias),
+        )
 
-    def _first_layer(self, inputs: th.Tensor, weight: th.Tensor) -> th.Tensor:
-        bias = self.input_layer.bias.view(self.n_outputs, 1, self.width)
-        return th.baddbmm(bias, inputs.expand(self.n_outputs, -1, -1), weight.mT)
-
-    def _hidden_layers(self, inputs: th.Tensor, weight: th.Tensor) -> list[th.Tensor]:
+    def _hidden_layers(self, inputs: th.Tensor, of: _BlockLayers) -> list[th.Tensor]:
         """Each of shape ``(m, batch, w)``: in this order, no product of the forward and backward pass needs a copy."""
         # tanh is smooth, as a Jacobian has to be, and cheaper than GELU or SiLU
         # In place: half of the memory, which then stays in the cache
-        layers = [tanh_(self._first_layer(inputs, weight))]
-        for hidden_weight, bias in zip(self.hidden_weights, self.hidden_biases, strict=True):
+        repeated = inputs.expand(len(of.input_weight), -1, -1)
+        layers = [tanh_(th.baddbmm(of.input_bias.unsqueeze(1), repeated, of.input_weight.mT))]
+        for hidden_weight, bias in of.hidden:
             layers.append(tanh_(th.baddbmm(bias, layers[-1], hidden_weight)))
         return layers
 
-    def _outputs(self, hidden: th.Tensor) -> th.Tensor:
-        return th.baddbmm(self.output_bias.view(-1, 1, 1), hidden, self.output_weight.unsqueeze(2)).squeeze(2).t()
+    def _outputs(self, hidden: th.Tensor, of: _BlockLayers) -> th.Tensor:
+        return th.baddbmm(of.output_bias.view(-1, 1, 1), hidden, of.output_weight.unsqueeze(2)).squeeze(2).t()
 
-    def forward(self, inputs: th.Tensor, mask: th.Tensor) -> th.Tensor:
+    def forward(self, inputs: th.Tensor, mask: th.Tensor, chosen: Chosen = ALL) -> th.Tensor:
         """
-        :param inputs: Shape ``(batch, p)``
-        :param mask: Shape ``(m, p)``
-        :return: Shape ``(batch, m)``
+        :param inputs: The chosen ones, shape ``(batch, p)``
+        :param mask: Of the chosen outputs and inputs, shape ``(m, p)``
+        :param chosen: Of the outputs and inputs
+        :return: The chosen outputs, shape ``(batch, m)``
         """
-        return self._outputs(self._hidden_layers(inputs, self._masked_input_weight(mask))[-1])
+        layers = self._layers(mask, chosen)
+        return self._outputs(self._hidden_layers(inputs, layers)[-1], layers)
 
     @th.no_grad()
     def forward_and_jacobian(
-        self, inputs: th.Tensor, mask: th.Tensor, columns: slice, scale: th.Tensor
+        self, inputs: th.Tensor, mask: th.Tensor, columns: slice, scale: th.Tensor, chosen: Chosen = ALL
     ) -> tuple[th.Tensor, th.Tensor]:
         """
-        :param inputs: Shape ``(batch, p)``
-        :param mask: Shape ``(m, p)``
-        :param columns: The inputs by which to differentiate, q of them
+        :param inputs: The chosen ones, shape ``(batch, p)``
+        :param mask: Of the chosen outputs and inputs, shape ``(m, p)``
+        :param columns: Those of these inputs by which to differentiate, q of them
         :param scale: What the outputs are multiplied with before they are differentiated, shape ``(m, 1)``
+        :param chosen: Of the outputs and inputs
         :return: The outputs, shape ``(batch, m)``, and their Jacobian, shape ``(batch, m, q)``, both without a graph
         """
-        weight = self._masked_input_weight(mask)
-        layers = self._hidden_layers(inputs, weight)
-        return self._outputs(layers[-1]), self._input_jacobian(layers, weight[:, :, columns], scale * self.output_weight)
+        of = self._layers(mask, chosen)
+        layers = self._hidden_layers(inputs, of)
+        jacobian = self._input_jacobian(layers, of.input_weight[:, :, columns], of.hidden, scale * of.output_weight)
+        return self._outputs(layers[-1], of), jacobian
 
-    def _input_jacobian(self, layers: list[th.Tensor], input_weight: th.Tensor, output_weight: th.Tensor) -> th.Tensor:
+    def _input_jacobian(
+        self, layers: list[th.Tensor], input_weight: th.Tensor, hidden: list[WeightAndBias], output_weight: th.Tensor
+    ) -> th.Tensor:
         # Each hidden unit belongs to one output: back-propagating all outputs at once keeps their derivatives apart
         gradient = _through_tanh(output_weight.unsqueeze(1), layers[-1])
-        for hidden_weight, hidden in zip(reversed(list(self.hidden_weights)), reversed(layers[:-1]), strict=True):
-            gradient = _through_tanh(th.bmm(gradient, hidden_weight.mT), hidden)
+        for (hidden_weight, _), values in zip(reversed(hidden), reversed(layers[:-1]), strict=True):
+            gradient = _through_tanh(th.bmm(gradient, hidden_weight.mT), values)
         return th.bmm(gradient, input_weight).transpose(0, 1)
 
 
@@ -99,21 +152,23 @@ class ManyMaskedBlocks(MaskedBlocks):
     so that the first one is one large product that no transposition follows, and the others can be vectorised.
     """
 
-    def _hidden_layers(self, inputs: th.Tensor, weight: th.Tensor) -> list[th.Tensor]:
-        first = linear(weight.flatten(0, 1), inputs) + self.input_layer.bias.unsqueeze(1)
-        layers = [tanh_(first.view(self.n_outputs, self.width, -1))]
-        for hidden_weight, bias in zip(self.hidden_weights, self.hidden_biases, strict=True):
+    def _hidden_layers(self, inputs: th.Tensor, of: _BlockLayers) -> list[th.Tensor]:
+        first = linear(of.input_weight.flatten(0, 1), inputs) + of.input_bias.flatten().unsqueeze(1)
+        layers = [tanh_(first.view(len(of.input_weight), self.width, -1))]
+        for hidden_weight, bias in of.hidden:
             layers.append(tanh_(th.baddbmm(bias.mT, hidden_weight.mT, layers[-1])))
         return layers
 
-    def _outputs(self, hidden: th.Tensor) -> th.Tensor:
+    def _outputs(self, hidden: th.Tensor, of: _BlockLayers) -> th.Tensor:
         # Of batched products with one row each, PyTorch makes as many calls
-        return ((hidden * self.output_weight.unsqueeze(2)).sum(dim=1) + self.output_bias.unsqueeze(1)).t()
+        return ((hidden * of.output_weight.unsqueeze(2)).sum(dim=1) + of.output_bias.unsqueeze(1)).t()
 
-    def _input_jacobian(self, layers: list[th.Tensor], input_weight: th.Tensor, output_weight: th.Tensor) -> th.Tensor:
+    def _input_jacobian(
+        self, layers: list[th.Tensor], input_weight: th.Tensor, hidden: list[WeightAndBias], output_weight: th.Tensor
+    ) -> th.Tensor:
         gradient = _through_tanh(output_weight.unsqueeze(2), layers[-1])
-        for hidden_weight, hidden in zip(reversed(list(self.hidden_weights)), reversed(layers[:-1]), strict=True):
-            gradient = _through_tanh(th.bmm(hidden_weight, gradient), hidden)
+        for (hidden_weight, _), values in zip(reversed(hidden), reversed(layers[:-1]), strict=True):
+            gradient = _through_tanh(th.bmm(hidden_weight, gradient), values)
         return th.bmm(gradient.mT, input_weight).transpose(0, 1)
 
 
@@ -147,26 +202,31 @@ def _drawn(mask: th.Tensor) -> th.Tensor:
 
 
 class ActionResponse(NamedTuple):
-    """What the world model predicts at an action, and how that moves with the action, in raw units and without a graph."""
+    """
+    What the world model predicts at an action, and how that moves with the action, in raw units and without a graph. It is
+    about m of the n states.
+    """
 
     next_state: th.Tensor
-    """Mean of the next state, shape ``(batch, n)``."""
+    """Mean of the next state, shape ``(batch, n)``; what it is not about is as in the state."""
     next_state_std: th.Tensor
-    """Standard deviation of the next state, shape ``(n,)``."""
+    """Standard deviation of the next state, shape ``(m,)``."""
     standardised_jacobian: th.Tensor
-    """d next state / d action in these standard deviations, shape ``(batch, n, d)``."""
+    """d next state / d action in these standard deviations, shape ``(batch, m, d)``."""
     reward: th.Tensor
     """Mean of the reward at the predicted next state, shape ``(batch,)``."""
     reward_std: th.Tensor
     """Standard deviation of the reward, shape ``()``."""
     reward_by_next_state: th.Tensor
-    """Partial derivative of the reward by the next state, shape ``(batch, n)``."""
+    """Partial derivative of the reward by the next state, shape ``(batch, m)``."""
     reward_by_action: th.Tensor
     """Partial derivative of the reward by the action, shape ``(batch, d)``."""
+    states: Chosen = ALL
+    """What it is about, as outputs of the transition model."""
 
     @property
     def next_state_jacobian(self) -> th.Tensor:
-        """d next state / d action, shape ``(batch, n, d)``."""
+        """d next state / d action, shape ``(batch, m, d)``."""
         return self.next_state_std.unsqueeze(1) * self.standardised_jacobian
 
     @property
@@ -178,7 +238,7 @@ class ActionResponse(NamedTuple):
         """
         The chain rule, for several gradients in one pass over the Jacobian.
 
-        :param gradients: Of something by the next state, each of shape ``(batch, n)``
+        :param gradients: Of something by the next state, each of shape ``(batch, m)``
         :return: Of the same by the action, shape ``(batch, d)``; of several, shape ``(batch, q, d)``
         """
         rows = th.stack(gradients, dim=1) * self.next_state_std
@@ -199,7 +259,8 @@ class MaskedWorldModel(nn.Module):
     ``n w (n + d) + (L - 1) n w^2 + n w`` for the transition model. A block has ``w = max(8, net_arch[0] / sqrt(n))`` units (a
     multiple of 8), so that the hidden layers of all blocks cost as much as those of one network of the width that ``net_arch``
     names. With 256 units and 4 layers: HalfCheetah (n=17, d=6) w=64, 0.24 M; Humanoid (n=348, d=17) w=16, 2.3 M, against 0.23
-    M of one of its Q networks (3 x 256), and 100 M of n separate networks of full width.
+    M of one of its Q networks (3 x 256), and 100 M of n separate networks of full width. Only m blocks and m + d inputs are
+    computed after :meth:`model_only`.
 
     :param state_dim: Number of state variables n
     :param action_dim: Number of action components d
@@ -213,6 +274,7 @@ class MaskedWorldModel(nn.Module):
     STATISTICS_WINDOW = 1_000
     INPUT_BOUND = 10.0
     MANY_STATES = 64  # from where ManyMaskedBlocks are faster
+    MODELLED_STEP = 8  # their number is a multiple: compiled graphs and recordings have a fixed one
     LOG_STD_BOUNDS = (-5.0, 2.0)
 
     state_to_state: th.Tensor
@@ -229,6 +291,8 @@ class MaskedWorldModel(nn.Module):
     """Running variance of the states, 1 for those that do not move, shape ``(n,)``."""
     reward_unit_square: th.Tensor
     """Running variance of the rewards, 1 if they do not move, shape ``()``."""
+    columns: th.Tensor
+    """Indices of inputs: those of the modelled states first, the actions next, shape ``(n + d,)``."""
 
     def __init__(self, state_dim: int, action_dim: int, net_arch: list[int] | None = None) -> None:
         super().__init__()
@@ -262,6 +326,11 @@ class MaskedWorldModel(nn.Module):
         # They follow from the others: once for an update, not each time that they are needed
         self.register_buffer("state_unit_square", th.ones(state_dim), persistent=False)
         self.register_buffer("reward_unit_square", th.ones(()), persistent=False)
+        # One tensor that stays in its place, which recordings of updates read
+        self.register_buffer("columns", th.arange(state_dim + action_dim), persistent=False)
+        self.n_modelled = state_dim
+        self.modelled_indices: np.ndarray | None = None
+        """Of the modelled states, None for all."""
 
     def set_masks(
         self,
@@ -293,6 +362,37 @@ class MaskedWorldModel(nn.Module):
                 raise ValueError(f"{name} must hold values in [0, 1], got values from {mask.min()} to {mask.max()}")
         for name, mask in masks.items():
             getattr(self, name).copy_(mask)
+
+    @th.no_grad()
+    def model_only(self, states: th.Tensor) -> th.Tensor:
+        """
+        Say of which states the next value is learned, and reckoned with by the guidance; all at first. The others cost
+        nothing then, and :meth:`predict_next_state` says of them what was known when they were left out.
+
+        :param states: Boolean, shape ``(n,)``; a few more are modelled, up to a multiple of 8
+        :return: Which states are modelled that were not before, boolean, shape ``(n,)``
+        """
+        before = self.modelled_states
+        n_wanted = math.ceil(int(states.sum()) / self.MODELLED_STEP) * self.MODELLED_STEP
+        self.n_modelled = min(n_wanted, self.state_dim)
+        first = th.argsort(~states.cpu(), stable=True)
+        chosen, others = first[: self.n_modelled].sort().values, first[self.n_modelled :].sort().values
+        actions = th.arange(self.state_dim, self.state_dim + self.action_dim)
+        self.columns.copy_(th.cat([chosen, actions, others]))
+        self.modelled_indices = None if self.n_modelled == self.state_dim else chosen.numpy()
+        return self.modelled_states & ~before
+
+    @property
+    def modelled_states(self) -> th.Tensor:
+        """Which states are modelled, boolean, shape ``(n,)``."""
+        modelled = th.zeros(self.state_dim, dtype=th.bool, device=self.columns.device)
+        modelled[self.columns[: self.n_modelled]] = True
+        return modelled
+
+    def _modelled(self) -> Chosen:
+        if self.n_modelled == self.state_dim:
+            return ALL
+        return Chosen(self.columns[: self.n_modelled], self.columns[: self.n_modelled + self.action_dim])
 
     def _set_units(self) -> None:
         for square, variance, mean in (
@@ -355,15 +455,23 @@ class MaskedWorldModel(nn.Module):
         # With equal variances of s and s': var(s' - c s) = (1 - c)^2 + c var(s' - s)
         return ((1.0 - gate).square() + gate * change).sqrt().clamp(min=1e-4)
 
-    def _network_input(self, state: th.Tensor, action: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
-        standardised = (state - self.state_mean) / self.state_std
+    def _network_input(self, state: th.Tensor, action: th.Tensor, of: Chosen = ALL) -> tuple[th.Tensor, th.Tensor]:
+        """Of the chosen states, standardised, and the inputs of the networks."""
+        standardised = (of.outputs(state, 1) - of.outputs(self.state_mean)) / of.outputs(self.state_std)
         return standardised, th.cat([standardised.clamp(-self.INPUT_BOUND, self.INPUT_BOUND), action], dim=1)
 
-    def _transition_mask(self) -> th.Tensor:
-        return th.cat([self.state_to_state, self.action_to_state], dim=1)
+    def _transition_mask(self, of: Chosen = ALL) -> th.Tensor:
+        mask = of.inputs(th.cat([of.outputs(self.state_to_state), of.outputs(self.action_to_state)], dim=1), 1)
+        if of is ALL and self.n_modelled < self.state_dim:
+            # What is modelled has learned from what is modelled alone
+            mask[self.columns[: self.n_modelled].unsqueeze(1), self.columns[self.n_modelled + self.action_dim :]] = 0.0
+        return mask
 
-    def _reward_mask(self) -> th.Tensor:
-        return th.cat([self.state_to_reward, self.action_to_reward]).unsqueeze(0)
+    def _reward_mask(self, of: Chosen = ALL) -> th.Tensor:
+        mask = of.inputs(th.cat([self.state_to_reward, self.action_to_reward]), 0)
+        if of is ALL and self.n_modelled < self.state_dim:
+            mask[self.columns[self.n_modelled + self.action_dim :]] = 0.0
+        return mask.unsqueeze(0)
 
     def _bounded(self, log_std: th.Tensor) -> th.Tensor:
         return log_std.clamp(*self.LOG_STD_BOUNDS)
@@ -376,14 +484,17 @@ class MaskedWorldModel(nn.Module):
         """
         return self._next_state(state, action, self._transition_mask())
 
-    def _next_state(self, state: th.Tensor, action: th.Tensor, mask: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
-        state_std = self.state_std
-        standardised, inputs = self._network_input(state, action)
-        residual_std = self.residual_std
-        change = residual_std * self.transition(inputs, mask)
-        mean = self.state_to_state.diagonal() * standardised + change
-        std = self._bounded(self.transition_log_std).exp() * residual_std * state_std
-        return self.state_mean + state_std * mean, std
+    def _next_state(
+        self, state: th.Tensor, action: th.Tensor, mask: th.Tensor, of: Chosen = ALL
+    ) -> tuple[th.Tensor, th.Tensor]:
+        """Of the chosen states."""
+        state_std = of.outputs(self.state_std)
+        standardised, inputs = self._network_input(state, action, of)
+        residual_std = of.outputs(self.residual_std)
+        change = residual_std * self.transition(inputs, mask, of)
+        mean = of.outputs(self.state_to_state.diagonal()) * standardised + change
+        std = self._bounded(of.outputs(self.transition_log_std)).exp() * residual_std * state_std
+        return of.outputs(self.state_mean) + state_std * mean, std
 
     def predict_reward(self, next_state: th.Tensor, action: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """
@@ -393,9 +504,11 @@ class MaskedWorldModel(nn.Module):
         """
         return self._reward(next_state, action, self._reward_mask())
 
-    def _reward(self, next_state: th.Tensor, action: th.Tensor, mask: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
-        _, inputs = self._network_input(next_state, action)
-        mean, scale = self.reward(inputs, mask).squeeze(1), self.reward_scale
+    def _reward(
+        self, next_state: th.Tensor, action: th.Tensor, mask: th.Tensor, of: Chosen = ALL
+    ) -> tuple[th.Tensor, th.Tensor]:
+        _, inputs = self._network_input(next_state, action, of)
+        mean, scale = self.reward(inputs, mask, Chosen(None, of.input_indices)).squeeze(1), self.reward_scale
         return self.reward_mean + scale * mean, self._bounded(self.reward_log_std).exp() * scale
 
     def negative_log_likelihood(
@@ -417,49 +530,58 @@ class MaskedWorldModel(nn.Module):
             batch. A weight behind a mask cannot grow to make up for it then, and with the masks themselves in its place, as in
             every prediction, the model's derivative by a cause is about the probability times what it is through the edge. The
             residual path keeps the masks
-        :return: That of the transition model, per variable, shape ``(batch,)``, and that of the reward model, ``(batch,)``
+        :return: That of the transition model, per modelled variable, shape ``(batch,)``, and that of the reward model,
+            ``(batch,)``
         """
-        transition_mask, reward_mask = self._transition_mask(), self._reward_mask()
+        of = self._modelled()
+        transition_mask, reward_mask = self._transition_mask(of), self._reward_mask(of)
         if sample_masks:
             transition_mask, reward_mask = _drawn(transition_mask), _drawn(reward_mask)
-        next_mean, next_std = self._next_state(state, action, transition_mask)
-        reward_mean, reward_std = self._reward(next_state, action, reward_mask)
-        transition = 0.5 * ((next_state - next_mean) / next_std).square() + self._bounded(self.transition_log_std)
+        next_mean, next_std = self._next_state(state, action, transition_mask, of)
+        reward_mean, reward_std = self._reward(next_state, action, reward_mask, of)
+        log_std = self._bounded(of.outputs(self.transition_log_std))
+        transition = 0.5 * ((of.outputs(next_state, 1) - next_mean) / next_std).square() + log_std
         reward_term = 0.5 * ((reward - reward_mean) / reward_std).square() + self._bounded(self.reward_log_std)
         return transition.mean(dim=1), reward_term
 
     @th.no_grad()
-    def action_response(self, state: th.Tensor, action: th.Tensor) -> ActionResponse:
+    def action_response(self, state: th.Tensor, action: th.Tensor, of_all: bool = True) -> ActionResponse:
         """
         Predict the next state and the reward under ``do(a)``, with their Jacobians by the action.
 
         :param state: s, shape ``(batch, n)``
         :param action: a in [-1, 1], shape ``(batch, d)``
+        :param of_all: Whether the response is about all states, or about the modelled ones alone
         :return: See :class:`ActionResponse`
         """
-        state_std, reward_scale = self.state_std, self.reward_scale
-        standardised, inputs = self._network_input(state, action)
-        residual_std = self.residual_std
-        actions = slice(self.state_dim, None)
-        noise_std = self._bounded(self.transition_log_std).exp()
+        of = ALL if of_all else self._modelled()
+        state_std, reward_scale = of.outputs(self.state_std), self.reward_scale
+        standardised, inputs = self._network_input(state, action, of)
+        residual_std = of.outputs(self.residual_std)
+        actions = slice(standardised.shape[1], None)
+        noise_std = self._bounded(of.outputs(self.transition_log_std)).exp()
         # In standard deviations from the start: Humanoid's Jacobians fill megabytes, and each pass over them takes time
         change, jacobian = self.transition.forward_and_jacobian(
-            inputs, self._transition_mask(), actions, (1.0 / noise_std).unsqueeze(1)
+            inputs, self._transition_mask(of), actions, (1.0 / noise_std).unsqueeze(1), of
         )
-        next_standardised = self.state_to_state.diagonal() * standardised + residual_std * change
+        next_standardised = of.outputs(self.state_to_state.diagonal()) * standardised + residual_std * change
         reward_inputs = th.cat([next_standardised.clamp(-self.INPUT_BOUND, self.INPUT_BOUND), action], dim=1)
         reward, reward_gradient = self.reward.forward_and_jacobian(
-            reward_inputs, self._reward_mask(), slice(None), reward_scale
+            reward_inputs, self._reward_mask(of), slice(None), reward_scale, Chosen(None, of.input_indices)
         )
         reward_gradient = reward_gradient.squeeze(1)
-        by_next_state, by_action = reward_gradient[:, : self.state_dim], reward_gradient[:, self.state_dim :]
+        by_next_state, by_action = reward_gradient.split([standardised.shape[1], self.action_dim], dim=1)
         by_next_state = by_next_state * (next_standardised.abs() <= self.INPUT_BOUND) / state_std
+        next_state = of.outputs(self.state_mean) + state_std * next_standardised
+        if of.output_indices is not None:
+            next_state = state.index_copy(1, of.output_indices, next_state)
         return ActionResponse(
-            next_state=self.state_mean + state_std * next_standardised,
+            next_state=next_state,
             next_state_std=noise_std * residual_std * state_std,
             standardised_jacobian=jacobian,
             reward=self.reward_mean + reward_scale * reward.squeeze(1),
             reward_std=self._bounded(self.reward_log_std).exp() * reward_scale,
             reward_by_next_state=by_next_state,
             reward_by_action=by_action,
+            states=of,
         )

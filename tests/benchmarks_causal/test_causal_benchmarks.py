@@ -62,3 +62,36 @@ def test_the_gate_is_judged_without_training(tmp_path):
     call("causal/relevance.py", *arguments)
     (row,) = csv.DictReader(output.open())
     assert row["behaviour"] == "random" and row["own_closed"] == "0" and row["others_open"] == "6 0 0"
+
+
+def test_the_graph_of_a_window_follows_a_world_that_changes(tmp_path):
+    pytest.importorskip("mujoco")
+    output = tmp_path / "switch.csv"
+    times = ["--at-step", 4000, "--after", 4000, "--windows", 2000, 0, "--seeds", 0, "--changes", "distractor"]
+    call("causal/switch.py", "--env", "InvertedPendulum-v5", *times, "--output", output)
+    window, everything = csv.DictReader(output.open())
+    assert int(window["edges_gone"]) > 0 and int(window["edges_come"]) > 0
+    assert int(window["steps_gone"]) <= 3000 and int(window["steps_come"]) <= 3000
+    assert everything["steps_gone"] == "never"
+
+
+def test_the_real_table_has_the_edges_that_the_documentation_names():
+    pytest.importorskip("statsmodels")
+    lines = dict(line.split(": ", 1) for line in call("causal/real_table.py").splitlines() if ": " in line)
+    assert lines["unemp'"] == "unemp 1.00" and lines["reward (infl)"] == "cpi 1.00"
+    assert "realcons" in lines["realinv'"] and "unemp" in lines["realinv'"] and lines["realgdp'"] == "-"
+
+
+def test_pucks_move_only_where_they_are_touched_and_the_benchmark_trains():
+    sys.path.append(str(FOLDER / "causal"))
+    import numpy as np
+    from objects import Pucks
+
+    env = Pucks()
+    for seed in range(20):
+        env.reset(seed=seed)
+        before, gap = env.puck.copy(), np.linalg.norm(env.puck - env.point)
+        env.step(np.zeros(2))
+        assert np.array_equal(before, env.puck) == (gap >= env.RADIUS)
+    arguments = ["--steps", 60, "--eval-freq", 60, "--episodes", 1, "--seeds", 0]
+    assert call("causal/objects.py", *arguments).count("success") == 2

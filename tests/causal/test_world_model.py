@@ -241,7 +241,7 @@ def test_action_response_is_what_autograd_finds(masked):
     reward, reward_std = model.predict_reward(next_state, actions)
     th.testing.assert_close(response.reward, reward)
     th.testing.assert_close(response.reward_std, reward_std)
-    assert not any(part.requires_grad for part in response)
+    assert not any(part.requires_grad for part in response if isinstance(part, th.Tensor))
     for row, (state, action) in enumerate(zip(states, actions, strict=True)):
         by_action = jacobian(lambda a, s=state: next_state_of(a, s)[0], action)
         th.testing.assert_close(response.next_state_jacobian[row], by_action, rtol=1e-4, atol=1e-5)
@@ -436,3 +436,73 @@ def test_the_reward_does_not_move_with_a_next_state_beyond_the_bound_of_the_inpu
         lambda one: model.predict_reward(model.predict_next_state(state, one)[0], one)[0], action
     )
     th.testing.assert_close(model.action_response(state, action).reward_jacobian, expected.flatten(1))
+
+
+# Some states alone --------------------------------------------------------------------------------------------------------
+
+
+def partial_model(n):
+    """Of many states, of which 10 are to be modelled: every third one, and six others to make the number a multiple of 8."""
+    th.manual_seed(0)
+    model = MaskedWorldModel(n, D, [16, 16])
+    states, actions = th.randn(6, n), th.rand(6, D) * 2 - 1
+    model.update_statistics(states, states + 0.3 * th.randn(6, n), th.randn(6))
+    model.set_masks(*(mask.clamp(min=0.1) for mask in random_masks(1, n)))
+    wanted = th.zeros(n, dtype=th.bool)
+    wanted[2:32:3] = True
+    return model, states, actions, wanted
+
+
+@pytest.mark.parametrize("n", [40, 80])
+def test_what_is_modelled_is_as_in_a_model_of_all_whose_other_edges_are_closed(n):
+    model, states, actions, wanted = partial_model(n)
+    assert isinstance(model.transition, ManyMaskedBlocks) == (n == 80)
+    newly = model.model_only(wanted)
+    modelled = model.modelled_states
+    assert modelled.sum() == 16 and bool((modelled | ~wanted).all()) and not newly.any()
+    response = model.action_response(states, actions, of_all=False)
+    of_all = model.action_response(states, actions)
+    assert response.standardised_jacobian.shape == (6, 16, D)
+    th.testing.assert_close(response.next_state[:, modelled], of_all.next_state[:, modelled])
+    assert th.equal(response.next_state[:, ~modelled], states[:, ~modelled])
+    th.testing.assert_close(response.standardised_jacobian, of_all.standardised_jacobian[:, modelled])
+    th.testing.assert_close(response.reward, of_all.reward)
+    th.testing.assert_close(response.reward_by_next_state, of_all.reward_by_next_state[:, modelled])
+    assert not of_all.reward_by_next_state[:, ~modelled].any()
+    # And so is a model that never heard of it, with those masks
+    edges = modelled.float()
+    plain, _, _, _ = partial_model(n)
+    closed = [model.state_to_state * th.where(modelled.unsqueeze(1), edges, 1.0), model.action_to_state]
+    plain.set_masks(*closed, model.state_to_reward * edges, model.action_to_reward)
+    for ours, theirs in zip(
+        (*model.predict_next_state(states, actions), *model.predict_reward(states, actions)),
+        (*plain.predict_next_state(states, actions), *plain.predict_reward(states, actions)),
+        strict=True,
+    ):
+        th.testing.assert_close(ours, theirs)
+    likelihoods = [one.negative_log_likelihood(states, actions, states + 0.1, states[:, 0]) for one in (model, plain)]
+    th.testing.assert_close(likelihoods[0][1], likelihoods[1][1])
+    assert not th.allclose(likelihoods[0][0], likelihoods[1][0])
+
+
+@pytest.mark.parametrize("n", [40, 80])
+def test_what_is_not_modelled_is_not_learned(n):
+    model, states, actions, wanted = partial_model(n)
+    model.model_only(wanted)
+    modelled = model.modelled_states
+    sum(part.sum() for part in model.negative_log_likelihood(states, actions, states + 0.1, states[:, 0])).backward()
+    assert model.transition_log_std.grad[modelled].all() and not model.transition_log_std.grad[~modelled].any()
+    for parameter in model.transition.parameters():
+        by_output = parameter.grad.view(n, -1)
+        assert by_output[modelled].any(dim=1).all() and not by_output[~modelled].any()
+    of_inputs = model.reward.input_layer.weight.grad
+    assert of_inputs[:, :n][:, modelled].any() and of_inputs[:, n:].any() and not of_inputs[:, :n][:, ~modelled].any()
+
+
+def test_all_are_modelled_again():
+    model, states, actions, wanted = partial_model(40)
+    before = model.predict_next_state(states, actions)[0]
+    model.model_only(wanted)
+    others = ~model.modelled_states
+    assert th.equal(model.model_only(th.ones(40, dtype=th.bool)), others)
+    assert th.equal(model.predict_next_state(states, actions)[0], before) and model.modelled_indices is None

@@ -227,6 +227,7 @@ ARGUMENTS = {
     "state_names": ["x", "y", "speed"],
     "action_names": ["push"],
     "causal_abstraction": {"patience": 3},
+    "counterfactual_replay": 0.25,
     "offline_dataset": "D4RL/pointmaze/umaze-v2",
     "pretrain_steps": 9,
     "offline_fraction": 0.25,
