@@ -25,7 +25,9 @@ AGENTS = ROOT / "rl-trained-agents"
 def trained(tmp_path_factory):
     """300 steps on Pendulum, with a causal graph, and the folder of its checkpoint."""
     networks = {"net_arch": [16], "world_model_net_arch": [16]}
-    model = CausalGDP("MlpPolicy", "Pendulum-v1", learning_starts=250, causal_refresh_freq=260, policy_kwargs=networks, seed=3, device="cpu")
+    model = CausalGDP(
+        "MlpPolicy", "Pendulum-v1", learning_starts=250, causal_refresh_freq=260, policy_kwargs=networks, seed=3, device="cpu"
+    )
     checkpoints = tmp_path_factory.mktemp("checkpoints")
     model.learn(300, TrainingCheckpointCallback(checkpoints / "Pendulum-v1_causalgdp_3"))
     return model, checkpoints
