@@ -28,6 +28,7 @@ LAYERS = [
     {"causal.plots", "causal.sources", "causal.guidance"},
     {"causal.transitions", "causal.discovery", "causal.interventions"},
     {"causal.world_model", "causal.statistics"},
+    {"causal.masked_blocks"},
     {"causal.endings"},
     {"causal.graph"},
     {"causal.rows"},

@@ -23,7 +23,8 @@ from sb3_causalgdp.acceleration.numpy_layers import (
     without_batch_norms,
     without_norms,
 )
-from sb3_causalgdp.causal.world_model import MaskedBlocks, MaskedWorldModel
+from sb3_causalgdp.causal.masked_blocks import MaskedBlocks
+from sb3_causalgdp.causal.world_model import MaskedWorldModel
 from sb3_causalgdp.diffusion import GuidanceRule
 from sb3_causalgdp.diffusion.plans import Point, Stage, sampling_plan, sampling_points
 from sb3_causalgdp.extractors import StandardizedExtractor

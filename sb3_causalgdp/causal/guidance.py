@@ -5,7 +5,8 @@ from typing import Any, NamedTuple, Protocol
 
 import torch as th
 
-from sb3_causalgdp.causal.world_model import ActionResponse, MaskedWorldModel
+from sb3_causalgdp.causal.masked_blocks import ActionResponse
+from sb3_causalgdp.causal.world_model import MaskedWorldModel
 from sb3_causalgdp.checks import check_at_least_zero, register
 
 

@@ -3,7 +3,7 @@ import torch as th
 from torch.autograd.functional import jacobian
 
 from sb3_causalgdp.causal import CausalGuidance, LinearisedGuidance, MaskedWorldModel, ReturnTarget, RewardTarget
-from sb3_causalgdp.causal.world_model import ActionResponse
+from sb3_causalgdp.causal.masked_blocks import ActionResponse
 
 N, D, BATCH = 4, 3, 6
 DISCOUNT, RETURN_STD = 0.9, th.tensor(2.5)

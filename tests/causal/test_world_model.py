@@ -4,7 +4,8 @@ import pytest
 import torch as th
 from torch.autograd.functional import jacobian
 
-from sb3_causalgdp.causal.world_model import ManyMaskedBlocks, MaskedBlocks, MaskedWorldModel
+from sb3_causalgdp.causal.masked_blocks import ManyMaskedBlocks, MaskedBlocks
+from sb3_causalgdp.causal.world_model import MaskedWorldModel
 
 N, D = 5, 3
 
