@@ -145,7 +145,7 @@ class Updates:
         :param replay_data: Sample of a replay buffer
         :return: Actions in the next states, shape ``(batch, d)``, None where a value network is asked; and what critics learn
             from: the TD target, shape ``(batch, 1)``, or, where they normalise batches, the next actions for which they say it
-            themselves in :meth:`critic_gradients`, shape ``(batch, d)``
+            themselves in ``critic_gradients``, shape ``(batch, d)``
         """
         n_actions = self.N_BACKUP_ACTIONS if self.model.max_q_backup else 1
         next_observations = replay_data.next_observations

@@ -51,7 +51,7 @@ class MaskedWorldModel(nn.Module):
     multiple of 8), so that the hidden layers of all blocks cost as much as those of one network of the width that ``net_arch``
     names. With 256 units and 4 layers: HalfCheetah (n=17, d=6) w=64, 0.24 M; Humanoid (n=348, d=17) w=16, 2.3 M, against 0.23
     M of one of its Q networks (3 x 256), and 100 M of n separate networks of full width. Only m blocks and m + d inputs are
-    computed after :meth:`model_only`.
+    computed after ``model_only``.
 
     :param state_dim: Number of state variables n
     :param action_dim: Number of action components d

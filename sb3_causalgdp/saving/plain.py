@@ -144,12 +144,17 @@ class Writer:
             return {"generator": self._encode(value.bit_generator.state, depth)}
         if kind is np.random.RandomState:
             return {"random_state": self._encode(value.get_state(legacy=False), depth)}
-        if isinstance(value, type):
-            if issubclass(value, np.generic) and np.dtype(value).kind in ARRAY_KINDS and np.dtype(value).type is value:
-                return {"numpy_type": np.dtype(value).str}
-            if self.known.named.get(name_of(value)) is value:
-                return {"class": name_of(value)}
-            raise NotPlainError(f"the class {name_of(value)}")
+        return self._class(value) if isinstance(value, type) else self._instance(value, depth)
+
+    def _class(self, value: type) -> Any:
+        if issubclass(value, np.generic) and np.dtype(value).kind in ARRAY_KINDS and np.dtype(value).type is value:
+            return {"numpy_type": np.dtype(value).str}
+        if self.known.named.get(name_of(value)) is value:
+            return {"class": name_of(value)}
+        raise NotPlainError(f"the class {name_of(value)}")
+
+    def _instance(self, value: Any, depth: int) -> Any:
+        kind = type(value)
         name = name_of(kind)
         if self.known.filled.get(name) is not kind:
             raise NotPlainError(f"an object of {name}")

@@ -54,10 +54,7 @@ class Table:
     ) -> None:
         self.name = name if name is not None else str(source) if isinstance(source, str) else "the table"
         self.remarks: tuple[str, ...] = ()
-        if missing not in MISSING:
-            raise ValueError(f"missing must be one of {MISSING}, got {missing!r}")
-        if isinstance(lag, bool) or not isinstance(lag, int) or lag < 1:
-            raise ValueError(f"lag must be an integer of at least 1, got {lag!r}")
+        _check_options(missing, lag)
         columns = columns_of(source)
         roles = _checked_roles(self.name, columns, states, actions, reward, next_states)
         for role, chosen in (("episode", episode), ("time", time)):
@@ -128,6 +125,13 @@ class Table:
 class _Numbers:
     names: tuple[str, ...]
     values: np.ndarray
+
+
+def _check_options(missing: str, lag: int) -> None:
+    if missing not in MISSING:
+        raise ValueError(f"missing must be one of {MISSING}, got {missing!r}")
+    if isinstance(lag, bool) or not isinstance(lag, int) or lag < 1:
+        raise ValueError(f"lag must be an integer of at least 1, got {lag!r}")
 
 
 def _checked_roles(
