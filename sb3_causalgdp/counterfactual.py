@@ -149,16 +149,16 @@ class CounterfactualReplay:
         """The inverse of :meth:`_states`."""
         space = self.model.observation_space
         if not isinstance(space, spaces.Dict):
-            assert space.shape is not None
             return states.reshape(-1, *space.shape)
         parts = states.split(self.model.policy.leaf_sizes, dim=1)
-        shapes = {key: box.shape or () for key, box in space.spaces.items()}
-        return {key: part.reshape(-1, *shapes[key]) for key, part in zip(shapes, parts, strict=True)}
+        return {
+            key: part.reshape(-1, *(box.shape or ())) for (key, box), part in zip(space.spaces.items(), parts, strict=True)
+        }
 
     def _written(self, sample: Any, parts: list[tuple[th.Tensor, Exchange]]) -> Any:
         rows = th.cat([part[exchange.exchanged] for part, exchange in parts])
-        kept = [Transitions(*(values[one.exchanged] for values in one.transitions)) for _, one in parts]
-        states, actions, next_states, rewards = (th.cat(list(column)) for column in zip(*kept, strict=True))
+        kept = [[values[one.exchanged] for values in one.transitions] for _, one in parts]
+        states, actions, next_states, rewards = (th.cat(column) for column in zip(*kept, strict=True))
         return sample._replace(
             observations=_with_rows(sample.observations, rows, self._observations(states)),
             actions=_with_rows(sample.actions, rows, actions),

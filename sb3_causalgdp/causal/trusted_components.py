@@ -61,7 +61,9 @@ class TrustedComponents:
             np.zeros(size) if values is None else np.asarray(values)
             for values, size in ((graph.state_vif, n_states), (graph.action_vif, n_actions))
         ]
-        groups.append(np.concatenate(inflation) > CONFOUNDED_VIF)
+        # Copies of different things are not bound to each other
+        is_copy = np.any(groups, axis=0) if groups else False
+        groups.append((np.concatenate(inflation) > CONFOUNDED_VIF) & ~np.asarray(is_copy))
         if ends is not None:
             groups.append(np.concatenate([ends, np.zeros(n_actions, dtype=bool)]))
         return groups

@@ -73,6 +73,17 @@ def test_what_no_graph_can_tell_apart_is_bound_together(changes):
     assert groups(trusted) == {frozenset({0, 2}), frozenset({1}), frozenset({3})}
 
 
+def test_copies_of_different_things_stay_apart():
+    variables = TransitionVariables(("x", "copy of x", "y", "copy of y"), ("push",))
+    masks = np.eye(5, 5)
+    graph = CausalGraph(variables, masks, np.zeros_like(masks), "by hand", 1_000, state_vif=np.full(4, 1e7))
+    copies = (("x'", "copy of x'"), ("y'", "copy of y'"))
+    trusted = TrustedComponents(variables)
+    for _ in range(2):
+        trusted.update(replace(graph, duplicated_variables=copies))
+    assert groups(trusted) == {frozenset({0, 1}), frozenset({2, 3}), frozenset({4})}
+
+
 def test_states_that_end_episodes_are_bound_together():
     trusted = TrustedComponents(VARIABLES)
     for _ in range(2):
