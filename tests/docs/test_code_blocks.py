@@ -4,7 +4,8 @@ The code of README and documentation: what a page says is run here, one test for
 Its ``python`` blocks run one after the other, in one namespace and in an empty folder. What takes hours is made to take
 seconds, and the pages need not know:
 
-- ``learn``, ``pretrain``, ``train`` and ``evaluate_policy`` stop after a few steps (``LIMITS``), and so does ``range(n)``;
+- ``learn``, ``pretrain``, ``train``, ``distil`` and ``evaluate_policy`` stop after a few steps (``LIMITS``), and so does
+  ``range(n)``;
 - ``CausalGDP`` and others have smaller defaults (``SMALL``);
 - Minari's datasets that pages name are on disk, a few steps of their environments.
 
@@ -62,6 +63,8 @@ LIMITS = (
     (OffPolicyAlgorithm, "learn", "total_timesteps", 48),
     (OfflineToOnlineAlgorithm, "pretrain", "gradient_steps", 3),
     (CausalGDP, "train", "gradient_steps", 2),
+    (CausalGDP, "distil", "gradient_steps", 20),
+    (CausalGDP, "distil", "n_observations", 100),
     (evaluation, "evaluate_policy", "n_eval_episodes", 1),
 )
 LONGEST_LOOP = 60
