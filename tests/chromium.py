@@ -26,7 +26,11 @@ TEXT = """(() => {
         if (node.nodeType === Node.ELEMENT_NODE) {
             if (["STYLE", "SCRIPT", "TEMPLATE"].includes(node.tagName)) return "";
             if (getComputedStyle(node).display === "none") return "";
-            if (node.tagName === "DETAILS" && !node.open) return text(node.querySelector("summary"));
+            if (node.tagName === "DETAILS" && !node.open) {
+                // Not there yet while the page is read
+                const summary = node.querySelector("summary");
+                return summary === null ? "" : text(summary);
+            }
         }
         const children = [...(node.shadowRoot ? node.shadowRoot.childNodes : []), ...node.childNodes];
         return children.map(text).join(" ");

@@ -10,26 +10,15 @@ import torch as th
 from small_models import SMALL
 
 from sb3_causalgdp import CausalGDP, CausalWorldModelCallback, causal, diffusion
-from sb3_causalgdp.causal.discovery import DISCOVERY_METHODS
-from sb3_causalgdp.causal.guidance import GUIDANCE_TARGETS
 from sb3_causalgdp.checks import register
-from sb3_causalgdp.diffusion.denoiser_types import DENOISERS
 from sb3_causalgdp.diffusion.plans import SAMPLERS, sampling_plan
-from sb3_causalgdp.diffusion.schedules import NOISE_SCHEDULES, NoiseSchedule
+from sb3_causalgdp.diffusion.schedules import NoiseSchedule
 
 PAGE = (Path(__file__).parents[1] / "docs" / "guide" / "extending.md").read_text(encoding="utf-8")
 BLOCKS = re.findall(r"^```python\n(.*?)^```$", PAGE, re.MULTILINE | re.DOTALL)
-REGISTRIES = (DISCOVERY_METHODS, GUIDANCE_TARGETS, DENOISERS, SAMPLERS, NOISE_SCHEDULES)
 
 
-@pytest.fixture(autouse=True)
-def registries():
-    """As they were before each test."""
-    before = [dict(registry) for registry in REGISTRIES]
-    yield
-    for registry, content in zip(REGISTRIES, before, strict=True):
-        registry.clear()
-        registry.update(content)
+pytestmark = pytest.mark.usefixtures("registries")
 
 
 @pytest.fixture

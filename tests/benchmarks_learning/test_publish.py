@@ -26,7 +26,9 @@ AGENTS = ROOT / "rl-trained-agents"
 def trained(tmp_path_factory):
     """300 steps on Pendulum, with a causal graph, and the folder of its checkpoint."""
     networks = {"net_arch": [16], "world_model_net_arch": [16]}
-    model = CausalGDP("MlpPolicy", "Pendulum-v1", **small(networks, learning_starts=250, causal_refresh_freq=260, seed=3))
+    model = CausalGDP(
+        "MlpPolicy", "Pendulum-v1", **small(networks, learning_starts=250, train_freq=1, causal_refresh_freq=260, seed=3)
+    )
     checkpoints = tmp_path_factory.mktemp("checkpoints")
     model.learn(300, TrainingCheckpointCallback(checkpoints / "Pendulum-v1_causalgdp_3"))
     return model, checkpoints

@@ -28,7 +28,7 @@ class LinearWorld(MaskedWorldModel):
         self.by_action = th.randn(N, D, generator=generator)
         self.reward_by_action = th.randn(D, generator=generator)
 
-    def action_response(self, state, action):
+    def action_response(self, state, action, of_all=True):
         std = th.tensor([0.5, 1.0, 2.0, 0.7])
         return ActionResponse(
             next_state=0.5 * state + action @ self.by_action.T,
@@ -190,7 +190,7 @@ def test_linearised_return_keeps_its_target(states, wished, actions):
 def test_linearised_evaluates_the_model_once(world, states, wished, actions, monkeypatch):
     calls = []
     original = world.action_response
-    monkeypatch.setattr(world, "action_response", lambda *args: calls.append(1) or original(*args))
+    monkeypatch.setattr(world, "action_response", lambda *args, **kwargs: calls.append(1) or original(*args, **kwargs))
     linearised = LinearisedGuidance(CausalGuidance(world, states, wished, make_target("reward")), actions)
     for _ in range(3):
         linearised(actions)

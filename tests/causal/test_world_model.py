@@ -345,7 +345,8 @@ def test_constant_variables_give_finite_predictions():
     losses = model.negative_log_likelihood(state, th.zeros(16, 1), state, reward)
     assert all(bool(loss.isfinite().all()) for loss in losses)
     response = model.action_response(state, th.zeros(16, 1))
-    assert all(bool(part.isfinite().all()) for part in response)
+    tensors = [part for part in response if isinstance(part, th.Tensor)]
+    assert len(tensors) > 3 and all(bool(part.isfinite().all()) for part in tensors)
 
 
 def test_likelihood_is_the_gaussian_one_up_to_a_constant():
@@ -422,7 +423,8 @@ def test_masks_and_statistics_are_saved():
     model, states, actions = make(0, random_masks(0))
     other = MaskedWorldModel(N, D, [16, 16])
     other.load_state_dict(model.state_dict())
-    for ours, theirs in zip(model.action_response(states, actions), other.action_response(states, actions), strict=True):
+    responses = [one.action_response(states, actions) for one in (model, other)]
+    for ours, theirs in zip(*([part for part in one if isinstance(part, th.Tensor)] for one in responses), strict=True):
         assert th.equal(ours, theirs)
 
 

@@ -206,7 +206,7 @@ def datasets(tmp_path_factory):
 
 
 @pytest.mark.parametrize("page", pages_with("python"), ids=name_of)
-def test_python_blocks_run(page, small_budgets, datasets, tmp_path, monkeypatch):
+def test_python_blocks_run(page, small_budgets, datasets, registries, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(datasets))
     namespace: dict[str, object] = {"__name__": "page"}
