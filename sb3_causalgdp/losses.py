@@ -26,13 +26,11 @@ class DenoisingTerms(NamedTuple):
     :param clean_actions: Clipped to [-1, 1] with a gradient that leads back inside, shape ``(batch, d)``: one step stands for
         the whole chain in the policy improvement of EDP (Kang et al., 2023, equation 9)
     :param outside: Mean squared distance of the clean actions from their bounds before they are clipped
-    :param trust_region: What :func:`trust_region_loss` says of another network's actions, None where there is none
     """
 
     loss: th.Tensor
     clean_actions: th.Tensor
     outside: th.Tensor
-    trust_region: th.Tensor | None = None
 
 
 def td_target(

@@ -15,7 +15,6 @@ from sb3_causalgdp.batches import Batches
 from sb3_causalgdp.causal.world_model import moves
 from sb3_causalgdp.diffusion import Guidance
 from sb3_causalgdp.losses import (
-    DenoisingTerms,
     advantage_weights,
     critic_loss,
     denoising_loss,
@@ -266,41 +265,34 @@ class Updates:
         return losses
 
     def actor_gradients(self, transitions, next_actions: th.Tensor, climbed: int, guided: bool) -> tuple[Losses, Gradients]:
-        denoising, q_term = self.actor_losses(transitions, next_actions, climbed, guided)
-        model, trust_region = self.model, denoising.trust_region
-        loss = model.denoising_weight * denoising.loss + model.eta * q_term + model.bound_penalty * denoising.outside
-        losses = {"denoising_loss": denoising.loss, "q_loss": q_term, "bound_loss": denoising.outside}
-        if trust_region is not None:
-            # The behaviour model shares no weights with the network that acts
-            loss = denoising.loss + model.denoising_weight * trust_region + model.eta * q_term
-            losses["trust_region_loss"] = trust_region
-        losses = {"actor_loss": loss, **losses}
-        return {name: value.detach() for name, value in losses.items()}, gradients_of(self.actor, loss)
-
-    def actor_losses(
-        self, transitions, next_actions: th.Tensor, climbed: int, guided: bool
-    ) -> tuple[DenoisingTerms, th.Tensor]:
         """
         :param transitions: Sample of single steps
         :param next_actions: After them
         :param climbed: Index of the critic that is climbed
         :param guided: Whether the denoising term is steered
-        :return: The denoising terms and the Q term
+        :return: The losses, the whole and its parts, and the gradients of the whole
         """
-        actor, update = self.actor, self.model.actor_update
-        learned = self.imitated if update == "imitation" else self.of_data
+        actor, model = self.actor, self.model
+        learned = self.imitated if model.actor_update == "imitation" else self.of_data
         observations, of_data, weights, guidance = learned(transitions, next_actions, climbed, guided)
         features = actor.features(observations)
         rule = self.policy.guidance_rule if guided else None
         how = (guidance, rule, actor.is_continuous, weights, actor.action_gate)
         denoising = denoising_loss(actor.denoiser, actor.schedule, features, of_data, *how)
-        if weights is not None:
-            return denoising, th.zeros_like(denoising.loss)
-        actions = denoising.clean_actions if update == "one_step" else actor.sample(features)
-        if update == "trust_region":
+        losses = {"denoising_loss": denoising.loss, "q_loss": th.zeros_like(denoising.loss), "bound_loss": denoising.outside}
+        if weights is None:
+            actions = denoising.clean_actions if model.actor_update == "one_step" else actor.sample(features)
+            losses["q_loss"] = self.q_term(observations, actions, of_data, climbed)
+        if model.actor_update == "trust_region":
             loss = trust_region_loss(actor.denoiser, actor.schedule, features, actions, actor.is_continuous)
-            denoising = denoising._replace(trust_region=loss)
-        return denoising, self.q_term(observations, actions, of_data, climbed)
+            # The behaviour model shares no weights with the network that acts
+            whole = denoising.loss + model.denoising_weight * loss + model.eta * losses["q_loss"]
+            losses["trust_region_loss"] = loss
+        else:
+            whole = model.denoising_weight * denoising.loss + model.eta * losses["q_loss"]
+            whole = whole + model.bound_penalty * denoising.outside
+        losses = {"actor_loss": whole, **losses}
+        return {name: value.detach() for name, value in losses.items()}, gradients_of(self.actor, whole)
 
     def of_data(self, transitions, next_actions: th.Tensor, climbed: int, guided: bool) -> Learned:
         """

@@ -360,7 +360,7 @@ def test_the_memory_efficient_buffer_gives_the_guidance_a_predicted_end_of_each_
     make_guidance = model.policy.make_guidance
     monkeypatch.setattr(model.policy, "make_guidance", lambda *args: asked.append(args) or make_guidance(*args))
     data = model.replay_buffer.sample(200)
-    model._updates.actor_losses(data, data.actions, 0, True)
+    model._updates.actor_gradients(data, data.actions, 0, True)
     ((state, next_state, _, _),) = asked
     ended = data.dones.flatten() > 0.0
     assert 0 < ended.sum() < 200

@@ -122,11 +122,19 @@ def test_a_delay_that_is_no_number_of_gradient_steps_is_refused(name, delay):
 # The action that the Q term judges --------------------------------------------------------------------------------------
 
 
+def q_term_and_its_gradients(model, data, climbed):
+    """By the parameters of the actor, of whose losses the others weigh nothing."""
+    model.denoising_weight = model.bound_penalty = 0.0
+    losses, gradients = model._updates.actor_gradients(data, data.actions, climbed, False)
+    th.testing.assert_close(losses["actor_loss"], losses["q_loss"])
+    return losses["q_loss"], gradients
+
+
 def q_term_and_its_noise(model, data):
-    """The Q term, and the action that the denoising term's own noise prediction gives."""
+    """The Q term with its gradients, and the action that the denoising term's own noise prediction gives."""
     actor, actions = model.actor, data.actions
     th.manual_seed(5)
-    _, q_term = model._updates.actor_losses(data, actions, climbed=0, guided=False)
+    q_term, gradients = q_term_and_its_gradients(model, data, climbed=0)
     th.manual_seed(5)
     step = th.randint(actor.schedule.n_steps, (len(actions),))
     noise = th.randn_like(actions)
@@ -134,7 +142,7 @@ def q_term_and_its_noise(model, data):
     noisy = alpha_bar.sqrt() * actions + (1.0 - alpha_bar).sqrt() * noise
     predicted = actor.denoiser(noisy, step, actor.features(data.observations))
     clean = (noisy - (1.0 - alpha_bar).sqrt() * predicted) / alpha_bar.sqrt()
-    return q_term, bounded(clean)
+    return q_term, gradients, bounded(clean)
 
 
 @pytest.mark.parametrize("n_critics, climbed, scale", [(1, 0, 0), (3, 0, 1), (3, 1, 2), (3, 2, 0)])
@@ -144,7 +152,7 @@ def test_the_next_critic_sets_the_scale_and_a_single_one_its_own(n_critics, clim
     model = CausalGDP("MlpPolicy", "Pendulum-v1", learning_starts=64, seed=0, device="cpu", **arguments)
     model.learn(64)
     data = model.replay_buffer.sample(64)
-    losses = []
+    found = []
     for plain in (False, True):
         th.manual_seed(5)
         if plain:
@@ -155,24 +163,24 @@ def test_the_next_critic_sets_the_scale_and_a_single_one_its_own(n_critics, clim
             size = values[scale].detach()
             if q_scale == "advantage":
                 size = size - q_values(model.critic, data.observations.float(), data.actions)[scale].detach()
-            losses.append(-values[climbed].mean() / size.abs().mean())
+            loss = -values[climbed].mean() / size.abs().mean()
+            found.append((loss.detach(), th.autograd.grad(loss, list(model.actor.parameters()))))
         else:
-            losses.append(model._updates.actor_losses(data, data.actions, climbed, False)[1])
-    th.testing.assert_close(*losses)
-    ours, theirs = (th.autograd.grad(loss, list(model.actor.parameters())) for loss in losses)
-    th.testing.assert_close(ours, theirs, rtol=1e-4, atol=1e-6)
+            found.append(q_term_and_its_gradients(model, data, climbed))
+    (ours, our_gradients), (theirs, their_gradients) = found
+    th.testing.assert_close(ours, theirs)
+    th.testing.assert_close(our_gradients, their_gradients, rtol=1e-4, atol=1e-6)
 
 
 def test_one_step_judges_the_clean_estimate_of_the_denoising_term():
     model = trained_model(actor_update="one_step")
     data = model.replay_buffer.sample(64)
-    q_term, clean = q_term_and_its_noise(model, data)
+    q_term, ours, clean = q_term_and_its_noise(model, data)
     first, second = q_values(
         model.critic, model.critic.extract_features(data.observations, model.critic.features_extractor), clean
     )
     expected = -first.mean() / second.detach().abs().mean()
-    th.testing.assert_close(q_term, expected, rtol=1e-5, atol=1e-6)
-    ours = th.autograd.grad(q_term, list(model.actor.parameters()))
+    th.testing.assert_close(q_term, expected.detach(), rtol=1e-5, atol=1e-6)
     for gradient, plain in zip(ours, th.autograd.grad(expected, list(model.actor.parameters())), strict=True):
         th.testing.assert_close(gradient, plain, rtol=1e-4, atol=1e-6)
 
@@ -180,7 +188,7 @@ def test_one_step_judges_the_clean_estimate_of_the_denoising_term():
 def test_the_chain_judges_where_the_chain_ends():
     model = trained_model(actor_update="chain")
     data = model.replay_buffer.sample(64)
-    q_term, clean = q_term_and_its_noise(model, data)
+    q_term, _, clean = q_term_and_its_noise(model, data)
     one_step = -q_values(model.critic, data.observations.float(), clean)[0].mean()
     assert not th.isclose(q_term, one_step, rtol=1e-3)
     th.manual_seed(5)
