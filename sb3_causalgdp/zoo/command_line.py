@@ -15,7 +15,8 @@ import gymnasium as gym
 from sb3_causalgdp import TrainingDivergedError
 from sb3_causalgdp.offline.registration import register_environments
 from sb3_causalgdp.saving.archives import FileError
-from sb3_causalgdp.zoo.registration import ALGORITHM, TRUST_OPTION, ZOO_HINT, SetupError, register
+from sb3_causalgdp.zoo.algorithm import ALGORITHM, TRUST_OPTION, ZOO_HINT, SetupError
+from sb3_causalgdp.zoo.registration import register
 from sb3_causalgdp.zoo.scripts import surroundings
 
 PROGRAM = "causalgdp-zoo"

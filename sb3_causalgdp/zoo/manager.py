@@ -30,12 +30,12 @@ from sb3_causalgdp.checkpoints.store import is_checkpoint
 from sb3_causalgdp.files import replaced_when_done, temporary_folder
 from sb3_causalgdp.offline.callbacks import NormalizedEvalCallback, WholeEvalCallback
 from sb3_causalgdp.offline.scores import find_reference
+from sb3_causalgdp.zoo.algorithm import ALGORITHM, SetupError, TrustingCausalGDP
 from sb3_causalgdp.zoo.going_on import FOLDER as CHECKPOINTS
 from sb3_causalgdp.zoo.going_on import RunLock, cut_monitors, interrupted_run, new_folder, write_command
 from sb3_causalgdp.zoo.hyperparameters import SCHEDULES, hyperparameter_file, make_schedule, merged, read_entry
 from sb3_causalgdp.zoo.offline_tasks import OFFLINE_TASKS
-from sb3_causalgdp.zoo.registration import ALGORITHM, SetupError, TrustingCausalGDP
-from sb3_causalgdp.zoo.scripts import replaced
+from sb3_causalgdp.zoo.replacing import replaced
 from sb3_causalgdp.zoo.search_space import sample_causalgdp_params
 from sb3_causalgdp.zoo.versions import installed_versions
 

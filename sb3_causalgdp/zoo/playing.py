@@ -13,8 +13,8 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_causalgdp import CausalGDP
+from sb3_causalgdp.zoo.algorithm import ALGORITHM, SetupError, WithoutReplayBuffer
 from sb3_causalgdp.zoo.played import Played
-from sb3_causalgdp.zoo.registration import ALGORITHM, SetupError, WithoutReplayBuffer
 from sb3_causalgdp.zoo.run_folder import RunFolder
 from sb3_causalgdp.zoo.settings import check_modules, safe_files
 

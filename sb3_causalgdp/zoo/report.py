@@ -5,10 +5,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from sb3_causalgdp.files import replaced_when_done
+from sb3_causalgdp.zoo.algorithm import ALGORITHM, SetupError
 from sb3_causalgdp.zoo.pages import report_page
 from sb3_causalgdp.zoo.played import Played
 from sb3_causalgdp.zoo.playing import load_first_whole, make_environment, models_to_try, play
-from sb3_causalgdp.zoo.registration import ALGORITHM, SetupError
 from sb3_causalgdp.zoo.report_sections import make_sections
 from sb3_causalgdp.zoo.run_folder import RunFolder, find_runs
 

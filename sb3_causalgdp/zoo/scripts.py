@@ -16,27 +16,13 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepR
 
 from sb3_causalgdp.offline.callbacks import note_success
 from sb3_causalgdp.saving.archives import errors_of, read_pickle
-from sb3_causalgdp.zoo.registration import ALGORITHM, ZOO_HINT
+from sb3_causalgdp.zoo.algorithm import ALGORITHM, ZOO_HINT
+from sb3_causalgdp.zoo.replacing import replaced
 from sb3_causalgdp.zoo.settings import safe_files, whole_files
 
 MODULE = "sb3_causalgdp.zoo"
 # On a card for people who may not have it yet: the folder of the source, and what the zoo needs
 INSTALL_SOURCE = 'pip install "./sb3_causalgdp[zoo]"'
-
-
-@contextmanager
-def replaced(owner: Any, name: str, value: Any) -> Iterator[None]:
-    """
-    :param owner: A module or a class
-    :param name: Its attribute
-    :param value: What it is for a while
-    """
-    before = getattr(owner, name)
-    setattr(owner, name, value)
-    try:
-        yield
-    finally:
-        setattr(owner, name, before)
 
 
 def own_command(command: Any) -> Any:

@@ -16,6 +16,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecNormalize
 from sb3_causalgdp.files import replaced_when_done
 from sb3_causalgdp.offline.callbacks import WholeEvalCallback
 from sb3_causalgdp.saving.archives import errors_of, read_pickle
+from sb3_causalgdp.zoo.replacing import replaced
 
 TAG = "tag:yaml.org,2002:python/"
 # Modules that a run's settings may name: importing another may run code that came with the run
@@ -183,8 +184,6 @@ def whole_files() -> Iterator[None]:
     """RL Zoo's normalizations and evaluations are replaced only once the new ones are complete, as all that we write."""
     from rl_zoo3 import exp_manager
 
-    from sb3_causalgdp.zoo.scripts import replaced
-
     save = VecNormalize.save
 
     def save_whole(normalizer: VecNormalize, save_path: str) -> None:
@@ -198,8 +197,6 @@ def whole_files() -> Iterator[None]:
 @contextmanager
 def safe_files() -> Iterator[None]:
     """RL Zoo reads YAML and normalizations of runs as its own files, which run what they hold."""
-    from sb3_causalgdp.zoo.scripts import replaced
-
     with ExitStack() as stack:
         stack.enter_context(replaced(yaml, "UnsafeLoader", ZooLoader))
         stack.enter_context(replaced(VecNormalize, "load", staticmethod(load_normalizer)))

@@ -13,7 +13,7 @@ from types import FrameType
 from typing import Any
 
 from sb3_causalgdp.hints import how_to_install
-from sb3_causalgdp.zoo.registration import SetupError
+from sb3_causalgdp.zoo.algorithm import SetupError
 from sb3_causalgdp.zoo.watch_folder import WatchedFolder
 
 PROGRAM = "causalgdp-zoo watch"

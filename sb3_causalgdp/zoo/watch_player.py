@@ -15,11 +15,11 @@ import torch as th
 from PIL import Image
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_causalgdp.zoo.algorithm import SetupError
 from sb3_causalgdp.zoo.pages import section_html
 from sb3_causalgdp.zoo.parts import Picture, Section, guarded
 from sb3_causalgdp.zoo.played import Played, transitions_played
 from sb3_causalgdp.zoo.playing import load_first_whole, make_environment, models_to_try, play
-from sb3_causalgdp.zoo.registration import SetupError
 from sb3_causalgdp.zoo.report_sections import effects_section, guidance_section
 from sb3_causalgdp.zoo.run_folder import RunFolder
 

@@ -84,7 +84,7 @@ def test_a_training_records_the_exact_command_and_what_was_installed(trained):
 
 
 def test_playing_takes_no_memory_for_transitions(zoo, logs, capsys, monkeypatch):
-    from sb3_causalgdp.zoo.registration import WithoutReplayBuffer
+    from sb3_causalgdp.zoo.algorithm import WithoutReplayBuffer
 
     loaded = []
     load = WithoutReplayBuffer.load.__func__

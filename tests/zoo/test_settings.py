@@ -9,7 +9,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecNormalize
 
 pytest.importorskip("rl_zoo3")
-from sb3_causalgdp.zoo.registration import SetupError
+from sb3_causalgdp.zoo.algorithm import SetupError
 from sb3_causalgdp.zoo.report import report
 from sb3_causalgdp.zoo.run_folder import RunFolder
 from sb3_causalgdp.zoo.settings import check_modules, check_normalize, load_normalizer, read_settings, safe_files

@@ -23,8 +23,8 @@ pytest.importorskip("bokeh", reason="the extra watch is not installed")
 from PIL import Image
 
 from sb3_causalgdp.zoo import watch_folder, watch_player
+from sb3_causalgdp.zoo.algorithm import SetupError
 from sb3_causalgdp.zoo.parts import Section
-from sb3_causalgdp.zoo.registration import SetupError
 from sb3_causalgdp.zoo.run_folder import RunFolder, run_folders
 from sb3_causalgdp.zoo.watch import make_server, names_of, url_of
 from sb3_causalgdp.zoo.watch_folder import WatchedFolder
