@@ -279,18 +279,19 @@ class Updates:
         rule = self.policy.guidance_rule if guided else None
         how = (guidance, rule, actor.is_continuous, weights, actor.action_gate)
         denoising = denoising_loss(actor.denoiser, actor.schedule, features, of_data, *how)
-        losses = {"denoising_loss": denoising.loss, "q_loss": th.zeros_like(denoising.loss), "bound_loss": denoising.outside}
         if weights is None:
             actions = denoising.clean_actions if model.actor_update == "one_step" else actor.sample(features)
-            losses["q_loss"] = self.q_term(observations, actions, of_data, climbed)
+            q_term = self.q_term(observations, actions, of_data, climbed)
+        else:
+            q_term = th.zeros_like(denoising.loss)
+        losses = {"denoising_loss": denoising.loss, "q_loss": q_term, "bound_loss": denoising.outside}
         if model.actor_update == "trust_region":
             loss = trust_region_loss(actor.denoiser, actor.schedule, features, actions, actor.is_continuous)
             # The behaviour model shares no weights with the network that acts
-            whole = denoising.loss + model.denoising_weight * loss + model.eta * losses["q_loss"]
+            whole = denoising.loss + model.denoising_weight * loss + model.eta * q_term
             losses["trust_region_loss"] = loss
         else:
-            whole = model.denoising_weight * denoising.loss + model.eta * losses["q_loss"]
-            whole = whole + model.bound_penalty * denoising.outside
+            whole = model.denoising_weight * denoising.loss + model.eta * q_term + model.bound_penalty * denoising.outside
         losses = {"actor_loss": whole, **losses}
         return {name: value.detach() for name, value in losses.items()}, gradients_of(self.actor, whole)
 

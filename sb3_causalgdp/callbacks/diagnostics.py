@@ -117,12 +117,12 @@ def dead_units(policy: CausalGDPPolicy, observations: PyTorchObs) -> dict[str, f
     :return: Of the ``actor`` and the ``critic``; a network without hidden units is left out
     """
     features = policy.actor.features(observations)
-    noise = candidate_noise(policy, len(features), deterministic=True)[0, : len(features)]
-    actions = policy.actor.sample(features, candidate_noise(policy, len(features), deterministic=True)[:, : len(features)])
+    noise = candidate_noise(policy, len(features), deterministic=True)[:, : len(features)]
+    actions = policy.actor.sample(features, noise)
     critic = policy.critic_target
     inputs = th.cat([critic.extract_features(observations, critic.features_extractor), actions], dim=1)
     calls: dict[str, list[tuple[nn.Module, tuple[Any, ...]]]] = {
-        "actor": [(policy.actor.denoiser, (noise, policy.actor.schedule.n_steps - 1, features))],
+        "actor": [(policy.actor.denoiser, (noise[0], policy.actor.schedule.n_steps - 1, features))],
         "critic": [(network, (inputs,)) for network in critic.q_networks],
     }
     shares = {}
