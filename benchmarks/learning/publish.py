@@ -45,16 +45,16 @@ NOT_FOR_PLAYING = ("causal_statistics",)
 SHOWN_VERSIONS = ("sb3_causalgdp", "Stable-Baselines3", "PyTorch", "Gymnasium", "mujoco", "gymnasium-robotics")
 HEAD = f"""# Trained agents
 
-Made by `python benchmarks/learning/publish.py`, in the folders of RL Zoo. In the folder above this one:
+Made by `python benchmarks/learning/publish.py`, in RL Zoo's folder layout. In the parent folder, run:
 
 ```bash
 causalgdp-zoo enjoy --env Hopper-v5 -f rl-trained-agents
 causalgdp-zoo report rl-trained-agents/{ALGORITHM}/Hopper-v5_1
 ```
 
-`sha256sum -c checksums.sha256`, in this folder, checks the files. One seed of each: they show what the package does, and
-decide nothing between algorithms. They have neither the optimizers' moments nor the statistics of causal discovery, so that a
-training that goes on from them begins with new ones.
+To check the files, run `sha256sum -c checksums.sha256` in this folder. There is one seed of each: these agents show what the
+package does, but do not rank algorithms. They include neither the optimizers' moments nor the statistics of causal discovery,
+so continuing their training starts with new ones.
 """
 
 
@@ -199,14 +199,14 @@ def write_table(folder: Path) -> None:
     :param folder: Of trained agents: their README and their checksums are written anew
     """
     cards = [yaml.safe_load(path.read_text(encoding="utf-8")) for path in sorted(folder.glob("*/*/*/card.yml"))]
-    lines = ["| task | steps | seed | return (of so many episodes, without noise) | size |", "|---|---|---|---|---|"]
+    lines = ["| task | steps | seed | return (episodes, without noise) | size |", "|---|---|---|---|---|"]
     lines += [
         f"| {card['task']} | {card['steps']:,} | {card['seed']} | {_return(card)} | {card['bytes'] / 1e6:.1f} MB |"
         for card in cards
     ]
     commands = [f"{card['command']}" for card in cards]
     versions = sorted({", ".join(f"{name} {version}" for name, version in card["versions"].items()) for card in cards})
-    parts = [HEAD, *lines, "", "The trainings, on one core:", "", "```bash", *commands, "```", "", "Trained with:", ""]
+    parts = [HEAD, *lines, "", "Training commands, on one core:", "", "```bash", *commands, "```", "", "Trained with:", ""]
     text = "\n".join([*parts, *(f"- {line}" for line in versions), ""])
     files = sorted(path for path in folder.glob("*/*/*") if path.suffix == ".zip")
     sums = [f"{hashlib.sha256(path.read_bytes()).hexdigest()}  {path.relative_to(folder).as_posix()}\n" for path in files]
