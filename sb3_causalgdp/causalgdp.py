@@ -58,7 +58,7 @@ class CausalGDP(AskedAlgorithm, DistilledAlgorithm, CheckedAlgorithm):
         function of the current progress remaining (from 1 to 0)
     :param buffer_size: Size of the replay buffer
     :param learning_starts: How many steps of the model to collect transitions for before learning starts, with random actions
-        or, after :meth:`pretrain`, the policy's
+        or, after :meth:`pretrain`, the policy's own
     :param batch_size: Minibatch size for each gradient update
     :param tau: The soft update coefficient ("Polyak update", between 0 and 1) of the target critics and of the actor's moving
         average
@@ -67,99 +67,99 @@ class CausalGDP(AskedAlgorithm, DistilledAlgorithm, CheckedAlgorithm):
         like ``(5, "step")`` or ``(2, "episode")``.
     :param gradient_steps: How many gradient steps to do after each rollout (see ``train_freq``)
         Set to ``-1`` means to do as many gradient steps as steps done in the environment during the rollout.
-    :param action_noise: The action noise type (None by default), on top of ``exploration_noise``
+    :param action_noise: The action noise type (None by default), added on top of ``exploration_noise``
     :param replay_buffer_class: Replay buffer class to use (for instance ``HerReplayBuffer``).
         If ``None``, it will be automatically selected.
     :param replay_buffer_kwargs: Keyword arguments to pass to the replay buffer on creation.
     :param optimize_memory_usage: Enable a memory efficient variant of the replay buffer at a cost of more complexity.
     :param n_steps: When n_step > 1, uses n-step return (with the NStepReplayBuffer) when updating the Q-value network; the
         world model still learns from single steps.
-    :param critic_learning_rate: Learning rate of the critics, a number or a schedule; None takes ``learning_rate``
+    :param critic_learning_rate: Learning rate of the critics, a number or a schedule; None uses ``learning_rate``
     :param world_model_learning_rate: Learning rate of the world model, a number or a schedule
-    :param eta: Weight of the Q term in the policy loss (the paper's table: 0.005 to 5)
-    :param denoising_weight: Weight of the denoising term in the policy loss: 1 is Diffusion-QL's, for fixed datasets; online,
-        where it pulls towards the actions of older policies, it has to be small
-    :param actor_update: Which action the Q term of the policy loss judges. ``one_step``: the clean action that the noise
-        prediction of the denoising term gives already (EDP, https://arxiv.org/abs/2305.20081), half the cost of an update;
+    :param eta: Weight of the Q term in the policy loss (0.005 to 5 in the paper's table)
+    :param denoising_weight: Weight of the denoising term in the policy loss: 1 as in Diffusion-QL for fixed datasets; it must
+        be small online, where it pulls towards the actions of older policies
+    :param actor_update: Which action the Q term of the policy loss evaluates. ``one_step``: the clean action estimated from
+        the denoising term's noise prediction (EDP, https://arxiv.org/abs/2305.20081), at half the cost of an update;
         ``chain``: the end of the whole chain, through which the gradient then flows (Diffusion-QL). Without a Q term:
-        ``weighted`` regresses onto the batch's actions, weighted by their advantage (IQL); ``imitation`` onto the actor's own,
-        a step further up Q (QVPO). ``trust_region``: a network that acts in one pass climbs Q where the denoiser, which models
-        the data alone, finds its actions likely (DTQL)
-    :param q_scale: What the Q term is divided by. ``value``: by the mean absolute Q (Diffusion-QL), which grows with the
-        returns; ``advantage``: by how much the Q of the policy's actions differs from that of the replayed ones, in the mean
-    :param expectile: If given, a network V(s) learns this expectile of Q of the actions in the data, and TD targets are made
-        with it (IQL, https://arxiv.org/abs/2110.06169): Q is asked of no other action. ``actor_update="weighted"`` needs it
-    :param advantage_temperature: Of ``actor_update="weighted"``: how much more an action counts for its advantage, in units of
-        the batch's mean absolute advantage
-    :param improvement_step: Of ``actor_update="imitation"``: how far up Q an action is moved, in each component of [-1, 1]
-    :param bound_penalty: Weight, in the policy loss, of the mean squared distance of clean actions from [-1, 1] before they
-        are clipped, so that none goes so far that it finds no way back
-    :param policy_delay: The actor is updated once every so many gradient steps, as in TD3. Where a call of :meth:`train` makes
-        many steps, the TD targets of those from one update of the actor to the next are computed at once
-    :param world_model_delay: The world model is updated once every so many gradient steps
+        ``weighted`` regresses onto the batch's actions, weighted by their advantage (IQL); ``imitation`` onto the actor's own
+        actions, moved a step up Q (QVPO). ``trust_region``: a network that acts in one pass climbs Q where the denoiser, which
+        models only the data, finds its actions likely (DTQL)
+    :param q_scale: What the Q term is divided by. ``value``: the mean absolute Q (Diffusion-QL), which grows with the returns;
+        ``advantage``: the mean difference in Q between the policy's actions and the replayed ones
+    :param expectile: If given, a network V(s) learns this expectile of Q over the data's actions, and TD targets use it (IQL,
+        https://arxiv.org/abs/2110.06169): Q is evaluated at no other action. Required by ``actor_update="weighted"``
+    :param advantage_temperature: For ``actor_update="weighted"``: how strongly an action's weight grows with its advantage, in
+        units of the batch's mean absolute advantage
+    :param improvement_step: For ``actor_update="imitation"``: how far up Q an action is moved, in each component of [-1, 1]
+    :param bound_penalty: Weight, in the policy loss, of the mean squared distance of clean actions from [-1, 1] before
+        clipping, so that no action drifts so far out that it cannot return
+    :param policy_delay: The actor is updated once every this many gradient steps, as in TD3. If a call of :meth:`train` takes
+        many steps, the TD targets of all steps up to the next actor update are computed at once
+    :param world_model_delay: The world model is updated once every this many gradient steps
     :param target_policy_noise: Standard deviation of the noise on the actions of TD targets, as in TD3
-    :param target_noise_clip: Limit of its absolute value
+    :param target_noise_clip: Limit on its absolute value
     :param max_q_backup: Whether the TD target takes the best of ten sampled actions (Diffusion-QL, for AntMaze)
-    :param max_grad_norm: Bound of the gradient norms of the actor and of the critics, None for no bound
+    :param max_grad_norm: Limit on the gradient norms of the actor and the critics, None for no limit
     :param diffusion_steps: Number of diffusion steps K
     :param noise_schedule: ``vp`` (Diffusion-QL), ``linear`` (DDPM) or ``cosine``
     :param sampler: ``ddpm``, ``ddim``, ``euler_maruyama``, ``heun`` or ``dpm_solver``
     :param ddim_eta: Noise of DDIM, from 0 (deterministic) to 1 (DDPM)
-    :param n_action_candidates: Number of sampled actions of which a prediction takes the best by the smallest target Q
+    :param n_action_candidates: Number of sampled actions from which a prediction takes the best, by the smallest of the
+        critics' Q
     :param exploration_noise: Standard deviation of the Gaussian noise of non-deterministic predictions, for actions in
         [-1, 1]; a number or a function of the current progress remaining (from 1 to 0)
-    :param guidance: ``posterior`` (the gradient of log p(y | a^k), with the uncertainty of the clean action in it), ``score``
-        (the paper's plain gradient), ``normalized`` (unit length), or None
-    :param guidance_target: What is wished for: ``return`` (one standard deviation of Q more than predicted) or ``reward`` (r*,
+    :param guidance: ``posterior`` (the gradient of log p(y | a^k), which accounts for the uncertainty of the clean action),
+        ``score`` (the paper's plain gradient), ``normalized`` (unit length), or None
+    :param guidance_target: What to aim for: ``return`` (one standard deviation of Q more than predicted) or ``reward`` (r*,
         the running 0.99 quantile of the rewards)
     :param guidance_covariance: ``tweedie``, ``isotropic`` or ``unit_gaussian``, for ``guidance="posterior"``
-    :param guidance_scale: lambda_k: one number, or one for each diffusion step from k = 1 to K
-    :param state_guidance_scale: gamma_t of the paper, scales the precision of the next state
-    :param outcome_guidance_scale: beta_t of the paper, scales the precision of the reward or return
+    :param guidance_scale: lambda_k: one number, or one per diffusion step from k = 1 to K
+    :param state_guidance_scale: The paper's gamma_t, scales the precision of the next state
+    :param outcome_guidance_scale: The paper's beta_t, scales the precision of the reward or return
     :param causal_discovery: Name of the discovery method, a key of ``sb3_causalgdp.causal.DISCOVERY_METHODS``: ``partial_r2``
-        also finds what is nonlinear, ``notears`` is the paper's linear method; or a callable like
+        also finds nonlinear effects, ``notears`` is the paper's linear method; or a callable like
         :class:`~sb3_causalgdp.causal.discovery.DiscoveryMethod`
     :param causal_discovery_kwargs: Arguments of the named discovery method
-    :param causal_refresh_freq: Rediscover the graph and rewrite the masks every so many environment steps
+    :param causal_refresh_freq: Rediscover the graph and update the masks every this many environment steps
     :param causal_half_life: Half-life, in transitions, of the statistics from which the graph is found; None forgets nothing
-    :param causal_window: Number of newest transitions from which the graph is found (the paper's temporal window); None takes
+    :param causal_window: Number of newest transitions from which the graph is found (the paper's temporal window); None uses
         all
-    :param sample_masks: How the world model trains on its masks. True: as probabilities, which edges are there is drawn anew
-        for each batch, so that an improbable edge carries little. False: as factors of the inputs, which what is learned
-        behind them makes up for unless they are 0
-    :param causal_abstraction: Whether actor and critics see only what can matter for any future reward by the graphs of the
-        training, and model only such actions; others are the middle of their range plus exploration noise. A dictionary holds
-        arguments of :class:`~sb3_causalgdp.causal.RelevanceGate`, and ``keep_open``, a list of names of states and actions
-        that are never hidden
-    :param counterfactual_replay: Share of a batch, from 0 to 1, whose transitions exchange what does not influence each other
-        by the graphs of the training: whole components, or what is independent at these states (CoDA,
-        https://arxiv.org/abs/2007.02863). Nothing is exchanged before two graphs in a row can be trusted
-    :param state_names: Names of the observation's components in graphs, pictures and answers; None takes the environment's own
-        (see :func:`~sb3_causalgdp.names.found_names`), or where it has none keys and indices
+    :param sample_masks: How the world model trains with its masks. True: as probabilities; edges are sampled for each batch,
+        so that an improbable edge carries little. False: as factors on the inputs, which the next layer learns to undo unless
+        they are 0
+    :param causal_abstraction: Whether actor and critics see only what, by the graphs found in training, can matter for any
+        future reward. Other actions are not modelled: they are the middle of their range plus exploration noise. A dictionary
+        passes arguments to :class:`~sb3_causalgdp.causal.RelevanceGate`, plus ``keep_open``, a list of names of states and
+        actions that are never hidden
+    :param counterfactual_replay: Share of a batch, from 0 to 1, whose transitions exchange parts that, by the graphs found in
+        training, do not influence each other: whole components, or what is independent in these states (CoDA,
+        https://arxiv.org/abs/2007.02863). Nothing is exchanged before two consecutive graphs can be trusted
+    :param state_names: Names of the observation's components in graphs, pictures and answers; None uses the environment's own
+        (see :func:`~sb3_causalgdp.names.found_names`) or, if it has none, keys and indices
     :param action_names: The same for the components of the actions
-    :param offline_dataset: Id of a Minari dataset, or path of a saved replay buffer or of arrays, that is preloaded when
-        training starts and no transitions are there; so a loaded model, whose buffer is empty, loads it again
-    :param pretrain_steps: Gradient steps of :meth:`pretrain` before the first step of ``learn()``; those that were made
-        before count, so that an interrupted run does the rest
+    :param offline_dataset: Id of a Minari dataset, or path of a saved replay buffer or of arrays, to preload when training
+        starts, unless there are transitions already; a loaded model, whose buffer is empty, loads it again
+    :param pretrain_steps: Gradient steps of :meth:`pretrain` before the first step of ``learn()``; steps made earlier count,
+        so that an interrupted run makes only the rest
     :param offline_fraction: Share of a batch that comes from preloaded transitions once ``learn()`` has collected others
         (symmetric sampling of RLPD, https://arxiv.org/abs/2302.02948); it can be a function of the current progress remaining
         (from 1 to 0)
-    :param reward_transform: What is done to the rewards of preloaded transitions, and then to the environment's too: a key of
-        :data:`~sb3_causalgdp.offline.rewards.REWARD_TRANSFORMS`; only a model with preloaded transitions transforms them
+    :param reward_transform: Transformation of the rewards of preloaded transitions, and then of the environment's, too: a key
+        of :data:`~sb3_causalgdp.offline.rewards.REWARD_TRANSFORMS`; only a model with preloaded transitions transforms rewards
     :param stats_window_size: Window size for the rollout logging, specifying the number of episodes to average
         the reported success rate, mean episode length, and mean reward over
     :param tensorboard_log: The log location for tensorboard (if None, no logging)
     :param policy_kwargs: Additional arguments to be passed to the policy on creation, see
         :class:`~sb3_causalgdp.policies.CausalGDPPolicy`
     :param compile: Whether to compile with ``torch.compile``, or its ``mode``: one graph for the loss and the gradients of
-        each network, with the world model and the guidance in it. The first updates then take a minute or two; the numbers
-        are the same up to rounding. Saved models do not depend on it. Needs PyTorch 2.13 and, on a CPU, a C++ compiler
-    :param cuda_graph: Whether gradient steps behind the first hundred are recorded as CUDA graphs and replayed, with
-        ``compile`` or without: on a GPU the launches of their kernels, and not their work, are what takes time. The numbers
-        are those of the plain steps. ``"auto"`` is True on a GPU, unless an optimizer cannot be recorded or ``compile`` makes
-        CUDA graphs itself
-    :param torch_threads: PyTorch's number of CPU threads during updates; None leaves it as it is. ``"auto"`` is 1 where
-        observations are vectors, whose networks are so small that threads only wait for each other, and otherwise None
+        each network, including the world model and the guidance. The first updates then take a minute or two; the numbers are
+        the same up to rounding. Saved models do not depend on it. Needs PyTorch 2.13 and, on a CPU, a C++ compiler
+    :param cuda_graph: Whether gradient steps after the first hundred are recorded as CUDA graphs and replayed, with or without
+        ``compile``: on a GPU, launching the kernels takes longer than their work. The numbers are those of the plain steps.
+        ``"auto"`` is True on a GPU, unless an optimizer cannot be recorded or ``compile`` makes CUDA graphs itself
+    :param torch_threads: PyTorch's number of CPU threads during updates; None leaves it unchanged. ``"auto"`` is 1 for vector
+        observations, whose networks are so small that threads mostly wait for each other, and None otherwise
     :param verbose: Verbosity level: 0 for no output, 1 for info messages (such as device or wrappers used), 2 for debug
         messages
     :param seed: Seed for the pseudo random generators

@@ -1,4 +1,4 @@
-"""What cannot go well is said before it is done: arguments that do not fit together, numbers that are none."""
+"""Errors before anything goes wrong: arguments that do not fit together, NaN and infinity from the environment."""
 
 import numpy as np
 from gymnasium import spaces
@@ -22,7 +22,7 @@ class CheckedAlgorithm(SavedAlgorithm):
     counterfactual_replay: float
 
     def _check_together(self) -> None:
-        """Arguments that are right alone, and not with the others."""
+        """Arguments that are valid alone, but not together."""
         if self.actor_update == "weighted" and self.expectile is None:
             raise ValueError("expectile must be a number with actor_update='weighted', got None")
         n_positions = self.buffer_size // self.n_envs
@@ -40,8 +40,8 @@ class CheckedAlgorithm(SavedAlgorithm):
         check_keywords("replay_buffer_kwargs", self.replay_buffer_kwargs, buffer_class)
         if self.counterfactual_replay > 0.0 and issubclass(buffer_class, NStepReplayBuffer):
             raise ValueError(
-                f"counterfactual_replay must be 0 with returns of several steps, got {self.counterfactual_replay}: what "
-                "happened between is not known of exchanged transitions"
+                f"counterfactual_replay must be 0 with n-step returns, got {self.counterfactual_replay}: the steps in between "
+                "are not known for exchanged transitions"
             )
 
     def _setup_learn(

@@ -43,14 +43,14 @@ class CausalGDPPolicy(AbstractingPolicy):
     """
     Policy of CausalGDP: diffusion actor, its moving average, critics, their targets and the masked world model.
 
-    Prediction draws candidate actions, takes the best of them by the smallest target Q, imagines its next state, and runs the
-    sampler again from the same noise, steered towards that state and towards the outcome that is wished for.
+    Prediction draws candidate actions, keeps the best of them by the smallest of the critics' Q, predicts its next state, and
+    runs the sampler again from the same noise, steered towards that state and towards the target outcome.
 
     :param observation_space: Observation space
     :param action_space: Action space
     :param lr_schedule: Learning rate schedule
     :param net_arch: Hidden layers of the denoiser and of the critics: a list, or ``dict(pi=[...], qf=[...])``
-    :param activation_fn: Activation of both: a class or its name
+    :param activation_fn: Activation function of both: a class or its name
     :param features_extractor_class: Features extractor to use
     :param features_extractor_kwargs: Keyword arguments of the features extractor
     :param normalize_images: Whether to divide images by 255
@@ -58,20 +58,20 @@ class CausalGDPPolicy(AbstractingPolicy):
     :param optimizer_kwargs: Its keyword arguments, without the learning rate
     :param n_critics: Number of critics
     :param critic_normalization: ``batch`` normalises the inputs of the critics' layers over the batch, and needs no target
-        critics (CrossQ, Bhatt et al., 2024); ``layer`` their hidden layers, which bounds what they say of actions that the
-        data does not hold (RLPD, Ball et al., 2023, section 4.2): for offline data; None is neither
-    :param normalize_observations: Whether actor and critics see observations in the standard deviations that the world model
-        measures while it trains; where there are images or an extractor of your own, they see them as they are
+        critics (CrossQ, Bhatt et al., 2024); ``layer`` normalises their hidden layers, which limits extrapolation to actions
+        that are not in the data (RLPD, Ball et al., 2023, section 4.2): for offline data; None does neither
+    :param normalize_observations: Whether actor and critics see observations in units of the standard deviations that the
+        world model measures during training; images and inputs of a custom extractor are left as they are
     :param share_features_extractor: Whether actor and critics share one features extractor
-    :param world_model_net_arch: Hidden layers of the world model, all of one size, ``[128, 128]`` by default
+    :param world_model_net_arch: Hidden layers of the world model, all the same size, ``[128, 128]`` by default
     :param diffusion_steps: Number of diffusion steps K
     :param noise_schedule: ``vp``, ``linear`` or ``cosine``
     :param sampler: One of :data:`~sb3_causalgdp.diffusion.SAMPLERS`
     :param ddim_eta: Noise of DDIM, in [0, 1]
     :param prediction_type: What a named denoiser predicts, ``noise`` or ``velocity``, see
         :class:`~sb3_causalgdp.diffusion.denoisers.Velocity`
-    :param sampling_steps: Number of the sampler's steps, None for K. With another number the denoiser learns, and is asked, at
-        all times between the diffusion steps
+    :param sampling_steps: Number of sampler steps, None for K. With a different number, the denoiser is trained and evaluated
+        at all times between the diffusion steps
     :param denoiser: ``mlp``, ``residual_mlp``, ``transformer``, or a class of your own, see
         :func:`~sb3_causalgdp.diffusion.make_denoiser`
     :param denoiser_kwargs: Further arguments of the denoiser
@@ -79,15 +79,15 @@ class CausalGDPPolicy(AbstractingPolicy):
     :param guidance_covariance: ``tweedie``, ``isotropic`` or ``unit_gaussian``, see
         :class:`~sb3_causalgdp.diffusion.GuidanceRule`
     :param guidance_target: ``return`` or ``reward``
-    :param guidance_scale: lambda_k: one number, or one for each diffusion step
+    :param guidance_scale: lambda_k: one number, or one per diffusion step
     :param state_guidance_scale: gamma, scales the precision of the next state
     :param outcome_guidance_scale: beta, scales the precision of the reward or return
-    :param n_action_candidates: Number of candidates N of which prediction plays the best
-    :param exploration_noise: Standard deviation of the Gaussian noise of stochastic predictions, actions being in [-1, 1]
+    :param n_action_candidates: Number of candidates N from which prediction plays the best
+    :param exploration_noise: Standard deviation of the Gaussian noise of stochastic predictions, for actions in [-1, 1]
     :param discount: Discount factor, for the return target
-    :param one_pass: Whether a perceptron acts, trained beside the denoiser: one pass, no candidates and no steering while
-        acting
-    :param value_network: Whether the critics have a network V(s) beside them
+    :param one_pass: Whether an MLP trained alongside the denoiser does the acting: one pass, without candidates or guidance
+        while acting
+    :param value_network: Whether the critics include a network V(s)
     :param causal_abstraction: Whether components of observations and actions can be hidden from actor and critics, see
         :meth:`~sb3_causalgdp.abstraction.AbstractingPolicy.show`
     """

@@ -242,7 +242,7 @@ def test_what_may_be_exchanged_survives_files(trained):
 def test_mistakes_are_named():
     with pytest.raises(ValueError, match=r"counterfactual_replay must be a number from 0 to 1, got 1\.5"):
         make(share=1.5)
-    with pytest.raises(ValueError, match="counterfactual_replay must be 0 with returns of several steps"):
+    with pytest.raises(ValueError, match="counterfactual_replay must be 0 with n-step returns"):
         make(n_steps=3)
     env = gym.make("Pendulum-v1")
     env.observation_space = spaces.Discrete(3)
