@@ -21,6 +21,7 @@ import numpy as np
 from sb3_causalgdp.causal import CausalGraph, TransitionVariables, make_discovery, make_statistics
 
 CHANGES = ("action", "sensor", "distractor")
+HISTORY_ROWS = 20_000
 
 
 class Swapped(gym.Wrapper):
@@ -114,6 +115,11 @@ def follow(
     graph, wrong = None, []  # numbers of edges that have not gone, and not come
     for end in range(every, len(rows) + 1, every):
         statistics.update(rows[end - every : end])
+        if statistics.wants_history:
+            # As the callback does it
+            statistics.restart()
+            n_held = min(end, window or HISTORY_ROWS, statistics.rows_since_change)
+            statistics.refill(rows[end - int(n_held) : end])
         graph = discovery(statistics, variables, graph)
         if end == at_step:
             gone, come = edges_that_change(graph, change)

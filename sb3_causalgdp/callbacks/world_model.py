@@ -115,7 +115,8 @@ class CausalWorldModelCallback(BaseCallback):
         self.logger.record("causal/change", graph.change_since(before))
         self.logger.record("causal/refresh_seconds", time.perf_counter() - start)
         if self.verbose >= 1:
-            print(f"Causal graph at {model.num_timesteps} steps: {count_of_edges(graph)}, from {graph.n_samples} transitions")
+            words = (f"{count_of_edges(graph)}, from {graph.n_samples} transitions", *graph.remarks)
+            print(f"Causal graph at {model.num_timesteps} steps: {'; '.join(words)}")
         self._log_diagnostics()
 
     def _states_that_end(self) -> np.ndarray:
@@ -177,15 +178,17 @@ class CausalWorldModelCallback(BaseCallback):
         model._fed_position = model._stored_position
         if getattr(statistics, "wants_history", False):
             statistics.restart()
-            for rows in self._history(offline, online):
+            for rows in self._history(offline, online, getattr(statistics, "rows_since_change", math.inf)):
                 statistics.refill(rows)
 
-    def _history(self, offline: ReplayBuffer | None, online: ReplayBuffer) -> Iterator[np.ndarray]:
-        if offline is not None:
-            n_rows = min(offline.size(), max(1, self.OFFLINE_HISTORY_ROWS // offline.n_envs))
-            yield from self._rows_at(offline, np.linspace(0, offline.size() - 1, n_rows).astype(np.int64))
+    def _history(self, offline: ReplayBuffer | None, online: ReplayBuffer, most_rows: float) -> Iterator[np.ndarray]:
+        """What is fed again, oldest first; of the newest rows alone, and no preloaded ones, if ``most_rows`` is finite."""
+        if offline is not None and (most_rows == math.inf or online is offline):
+            n_rows = min(offline.size(), max(1, min(most_rows, self.OFFLINE_HISTORY_ROWS) // offline.n_envs))
+            first = offline.size() - n_rows if most_rows < math.inf else 0
+            yield from self._rows_at(offline, np.linspace(first, offline.size() - 1, int(n_rows)).astype(np.int64))
         if online is not offline:
-            yield from self._newest_rows(online, max(1, self.HISTORY_ROWS // online.n_envs))
+            yield from self._newest_rows(online, max(1, min(most_rows, self.HISTORY_ROWS) // online.n_envs))
 
     def _newest_rows(self, buffer: ReplayBuffer, n_positions: float) -> Iterator[np.ndarray]:
         """The transitions of at most so many newest positions, oldest first, in parts that fit into memory."""

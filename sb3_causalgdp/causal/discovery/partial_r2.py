@@ -1,11 +1,12 @@
 import numpy as np
 import torch as th
 
+from sb3_causalgdp.causal.discovery.changes import forget_what_changed
 from sb3_causalgdp.causal.discovery.evidence import edge_probability
 from sb3_causalgdp.causal.discovery.regression import Estimates, Regression, regression_of_dynamics, regression_of_reward
 from sb3_causalgdp.causal.graph import CausalGraph
 from sb3_causalgdp.causal.statistics.basis import BASES, BasisMoments, bytes_needed
-from sb3_causalgdp.causal.statistics.degenerate import LimitsFinder
+from sb3_causalgdp.causal.statistics.degenerate import Limits, LimitsFinder
 from sb3_causalgdp.causal.statistics.grouped import GroupedStatistics
 from sb3_causalgdp.causal.statistics.jackknife import jackknife_error
 from sb3_causalgdp.causal.variables import TransitionVariables
@@ -39,6 +40,9 @@ class PartialR2:
     rows, its sign that of the mean, so an even function has an effect too. R^2 is adjusted for the number of features as well.
     Where several functions agree on all rows, as those of the cosine and the sine of an angle can, the one with the smallest
     squares and products is taken.
+
+    With a window, edges that are sure in its newest rows and surely not there in those before, or the other way around, say
+    that the world has changed: the rows before are forgotten (``causal.discovery.changes``).
 
     Linearly dependent variables are tested as a group and share its masks; variables that never move have no edges. Where rows
     are few, the products are left out, then sine and tanh, then the square, so that there are two rows for each feature.
@@ -121,12 +125,10 @@ class PartialR2:
             return statistics.spread_out(self(statistics.statistics, statistics.group_variables))
         statistics = self._checked(statistics, variables)
         limits = self._find_limits(statistics.raw.correlation(), variables)
-        n_tests = (variables.n_states + 1) * (variables.n_states + variables.n_actions)
-        rows = [
-            self._estimate(regression_of_dynamics(statistics, limits.of_dynamics), n_tests),
-            self._estimate(regression_of_reward(statistics, limits.of_reward), n_tests),
-        ]
-        masks, effects, errors, r_squared, evidence, detectable = (np.concatenate(parts) for parts in zip(*rows, strict=True))
+        changed = forget_what_changed(statistics, lambda part: self._estimates(part, limits)[0], self.min_rows(variables))
+        if changed:
+            limits = self._find_limits(statistics.raw.correlation(), variables)
+        masks, effects, errors, r_squared, evidence, detectable = self._estimates(statistics, limits)
         return CausalGraph(
             variables,
             masks=masks,
@@ -137,9 +139,17 @@ class PartialR2:
             detectable_r2=detectable,
             method="partial_r2",
             n_samples=statistics.dynamics.n_samples,
-            remarks=(statistics.remark,) if statistics.remark else (),
+            remarks=tuple(filter(None, (statistics.remark, changed))),
             **limits.remarks(),
         )
+
+    def _estimates(self, statistics: BasisMoments, limits: Limits) -> list[np.ndarray]:
+        """Those of ``_estimate``, of all next states and the reward."""
+        variables = statistics.variables
+        n_tests = (variables.n_states + 1) * (variables.n_states + variables.n_actions)
+        of_dynamics = self._estimate(regression_of_dynamics(statistics, limits.of_dynamics), n_tests)
+        of_reward = self._estimate(regression_of_reward(statistics, limits.of_reward), n_tests)
+        return [np.concatenate(pair) for pair in zip(of_dynamics, of_reward, strict=True)]
 
     def _estimate(self, regression: "Regression", n_tests: int) -> tuple[np.ndarray, ...]:
         """Masks, effects, their standard errors, each of shape (m, p), R^2, evidence, shape (m, p), and what it could see."""

@@ -150,6 +150,11 @@ class NoisyStatistics:
         """Whether the wrapped statistics want older rows again."""
         return getattr(self.statistics, "wants_history", False)
 
+    @property
+    def rows_since_change(self) -> float:
+        """Number of newest rows that are of the world as it is now."""
+        return getattr(self.statistics, "rows_since_change", np.inf)
+
     def update(self, rows: npt.ArrayLike) -> None:
         """
         Add a batch of rows; nothing changes when it raises.

@@ -1,5 +1,7 @@
 """Nonlinear features of transitions, and their streaming moments."""
 
+import copy
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -195,6 +197,8 @@ class BasisMoments:
     RECENT_ROWS = 256
     remark = ""
     """What was simplified to keep within the memory; empty where nothing was."""
+    rows_since_change = math.inf
+    """Number of newest rows that are of the world as it is now; infinite as long as no older ones were forgotten."""
 
     def __init__(
         self,
@@ -253,6 +257,7 @@ class BasisMoments:
             return
         for part in _in_parts(rows):
             self.raw.update(part)
+        self.rows_since_change += len(rows)
         self.recent = np.concatenate([self.recent, rows[-self.RECENT_ROWS :]])[-self.RECENT_ROWS :].copy()
         if self.expansions is None and self.raw.n_samples < self.FIRST_ROWS:
             self._waiting.append(rows.copy())
@@ -290,6 +295,25 @@ class BasisMoments:
         rows = self.raw.checked(rows)
         self.wants_history = False
         self._feed(rows)
+
+    def with_blocks(self, blocks: slice) -> "BasisMoments":
+        """
+        :param blocks: Which of the blocks of rows, oldest first
+        :return: statistics of these rows alone, only to be read
+        """
+        part = copy.copy(self)
+        part.raw, part.dynamics, part.reward = (each.with_blocks(blocks) for each in (self.raw, self.dynamics, self.reward))
+        return part
+
+    def forget_old(self, n_rows: float) -> None:
+        """
+        Forget older rows, also where they would be fed again, up to whole blocks.
+
+        :param n_rows: Number of newest rows that are kept, at least
+        """
+        for moments in (self.raw, self.dynamics, self.reward):
+            moments.forget_old(n_rows)
+        self.rows_since_change = self.dynamics.count
 
     def _set_expansions(self) -> None:
         spread = self.raw.spread()

@@ -95,6 +95,11 @@ class GroupedStatistics:
         """Sum of the rows' weights that is not fallen below once rows are forgotten."""
         return self.statistics.fewest_rows
 
+    @property
+    def rows_since_change(self) -> float:
+        """Number of newest rows that are of the world as it is now; infinite as long as no older ones were forgotten."""
+        return self.statistics.rows_since_change
+
     def update(self, rows: npt.ArrayLike) -> None:
         """
         Merge a batch of rows; nothing changes when it raises.
@@ -133,7 +138,9 @@ class GroupedStatistics:
     def restart(self) -> None:
         """Take the units of all rows fed so far, and forget the groups' moments."""
         self._scaled_by = self._spread
+        rows_since_change = self.rows_since_change
         self.statistics = BasisMoments(self.group_variables, *self._arguments)
+        self.statistics.rows_since_change = rows_since_change
         self._waiting = []
 
     def refill(self, rows: npt.ArrayLike) -> None:

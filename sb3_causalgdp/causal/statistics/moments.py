@@ -1,3 +1,4 @@
+import copy
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -307,6 +308,24 @@ class StreamingMoments:
             for i in range(self.n_blocks // 2):
                 self._blocks[i : i + 2] = [merge(self._blocks[i : i + 2], into_first=True)]
             self._block_rows *= 2
+
+    def with_blocks(self, blocks: slice) -> "StreamingMoments":
+        """
+        :param blocks: Which of the blocks that hold rows, oldest first
+        :return: moments of these rows alone, which share their arrays with these moments: only to be read
+        """
+        part = copy.copy(self)
+        part._blocks = self._blocks[blocks]
+        return part
+
+    def forget_old(self, n_rows: float) -> None:
+        """
+        Forget the oldest blocks, as long as those that are left weigh so much.
+
+        :param n_rows: Sum of the weights of the newest rows that are kept, at least
+        """
+        while self._blocks and self.count - self._blocks[0].count >= n_rows:
+            del self._blocks[0]
 
     @property
     def blocks(self) -> tuple[Moments, ...]:
