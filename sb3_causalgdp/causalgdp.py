@@ -97,6 +97,8 @@ class CausalGDP(AskedAlgorithm, DistilledAlgorithm, CheckedAlgorithm):
     :param policy_delay: The actor is updated once every this many gradient steps, as in TD3. If a call of :meth:`train` takes
         many steps, the TD targets of all steps up to the next actor update are computed at once
     :param world_model_delay: The world model is updated once every this many gradient steps
+    :param pessimism: How far TD targets go from the mean of the critics, 0, to the smallest of them, 1 (clipped double
+        Q-learning, as in TD3 and SAC). With 1, what the critics disagree by adds up over the discounted horizon
     :param target_policy_noise: Standard deviation of the noise on the actions of TD targets, as in TD3
     :param target_noise_clip: Limit on its absolute value
     :param max_q_backup: Whether the TD target takes the best of ten sampled actions (Diffusion-QL, for AntMaze)
@@ -212,6 +214,7 @@ class CausalGDP(AskedAlgorithm, DistilledAlgorithm, CheckedAlgorithm):
         bound_penalty: float = 0.1,
         policy_delay: int = 3,
         world_model_delay: int = 2,
+        pessimism: float = 0.0,
         target_policy_noise: float = 0.2,
         target_noise_clip: float = 0.5,
         max_q_backup: bool = False,
@@ -302,6 +305,7 @@ class CausalGDP(AskedAlgorithm, DistilledAlgorithm, CheckedAlgorithm):
         self.bound_penalty = bound_penalty
         self.policy_delay = policy_delay
         self.world_model_delay = world_model_delay
+        self.pessimism = pessimism
         self.target_policy_noise = target_policy_noise
         self.target_noise_clip = target_noise_clip
         self.max_q_backup = max_q_backup

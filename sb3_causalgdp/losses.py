@@ -39,9 +39,11 @@ def td_target(
     dones: th.Tensor,
     discounts: th.Tensor | float,
     n_backup_actions: int = 1,
+    pessimism: float = 1.0,
 ) -> th.Tensor:
     """
-    ``y = r + gamma (1 - done) min_i Q'_i(s', a')`` (clipped double Q-learning, Fujimoto et al., 2018).
+    ``y = r + gamma (1 - done) Q'(s', a')``, where Q' is between the mean of the critics and the smallest (clipped double
+    Q-learning, Fujimoto et al., 2018). What critics disagree by adds up over the steps of the discounted horizon.
 
     With several actions per next state, each critic first takes the best of them (``max_q_backup``, Diffusion-QL).
 
@@ -50,10 +52,14 @@ def td_target(
     :param dones: 1 where the episode terminated, a truncation bootstraps, shape ``(batch, 1)``
     :param discounts: gamma, or gamma^n of n-step returns, shape ``(batch, 1)``
     :param n_backup_actions: Number of actions per next state
+    :param pessimism: 0 for the mean of the critics, 1 for the smallest
     :return: Shape ``(batch, 1)``
     """
     best = th.stack([values.view(-1, n_backup_actions).amax(dim=1) for values in next_q_values])
-    return rewards + (1.0 - dones) * discounts * best.amin(dim=0).unsqueeze(1)
+    value = best.amin(dim=0)
+    if pessimism < 1.0:
+        value = th.lerp(best.mean(dim=0), value, pessimism)
+    return rewards + (1.0 - dones) * discounts * value.unsqueeze(1)
 
 
 def critic_loss(q_values: Sequence[th.Tensor], target: th.Tensor) -> th.Tensor:

@@ -54,6 +54,7 @@ _OF_DIFFUSION_QL: dict[str, Any] = {
     "gamma": 0.99,
     "n_steps": 1,
     "policy_delay": 1,
+    "pessimism": 1.0,
     "target_policy_noise": 0.0,
     "bound_penalty": 0.0,
     "n_action_candidates": 50,

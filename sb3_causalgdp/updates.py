@@ -98,10 +98,11 @@ class Updates:
         # All that the steps depend on and that may change while it trains
         weights = (model.eta, model.denoising_weight, model.bound_penalty, model.q_scale)
         of_methods = (model.expectile, model.advantage_temperature, model.improvement_step)
-        rates = (model.tau, model.gamma, model.max_grad_norm, model.target_policy_noise, model.target_noise_clip)
+        rates = (model.tau, model.gamma, model.max_grad_norm, model.pessimism)
+        noise = (model.target_policy_noise, model.target_noise_clip)
         scales = (self.policy.state_guidance_scale, self.policy.outcome_guidance_scale, self.world_model.n_modelled)
         with n_threads_at_most(model.torch_threads, self.policy.has_image_state):
-            yield self.fast.made_fast(gradient_steps, (weights, of_methods, rates, scales))
+            yield self.fast.made_fast(gradient_steps, (weights, of_methods, rates, noise, scales))
 
     def planned(self, gradient_steps: int, batch_size: int) -> Iterator[tuple[tuple[StepPlan, ...], list[Any]]]:
         """
@@ -169,7 +170,8 @@ class Updates:
         :return: What Q should be, without a gradient, shape ``(batch, 1)``
         """
         with th.no_grad():
-            return td_target(next_q_values, replay_data.rewards, replay_data.dones, self.discounts(replay_data), n_actions)
+            of_batch = (replay_data.rewards, replay_data.dones, self.discounts(replay_data))
+            return td_target(next_q_values, *of_batch, n_actions, self.model.pessimism)
 
     def discounts(self, replay_data) -> th.Tensor | float:
         """

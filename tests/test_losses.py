@@ -37,6 +37,13 @@ def test_target_takes_the_smallest_of_the_critics():
     th.testing.assert_close(target, column(10.5, 21.0, 33.0))
 
 
+def test_target_is_between_the_mean_of_the_critics_and_the_smallest():
+    next_q_values = [column(1.0, 5.0), column(3.0, 2.0), column(8.0, 2.0)]
+    for pessimism, expected in ((0.0, (14.0, 23.0)), (0.5, (12.5, 22.5)), (1.0, (11.0, 22.0))):
+        target = td_target(next_q_values, column(10.0, 20.0), th.zeros(2, 1), 1.0, pessimism=pessimism)
+        th.testing.assert_close(target, column(*expected))
+
+
 def test_a_terminated_episode_does_not_bootstrap():
     target = td_target([column(5.0, 5.0)], column(1.0, 2.0), column(1.0, 0.0), 0.9)
     th.testing.assert_close(target, column(1.0, 6.5))

@@ -203,6 +203,7 @@ ARGUMENTS = {
     "advantage_temperature": 2.0,
     "improvement_step": 0.2,
     "bound_penalty": 0.2,
+    "pessimism": 0.3,
     "target_policy_noise": 0.15,
     "target_noise_clip": 0.4,
     "policy_delay": 4,
