@@ -217,7 +217,7 @@ GROUPS: dict[str, dict[str, Kind]] = {
         "causal_discovery_kwargs": KEYWORDS | NONE,
         "causal_refresh_freq": STEPS,
         "sample_masks": FLAG,
-        "causal_abstraction": FLAG | KEYWORDS,
+        "causal_abstraction": FLAG | KEYWORDS | choice(["auto"]),
         "counterfactual_replay": SHARE,
         "causal_half_life": number(1.0, LARGEST_NUMBER) | NONE,
         "causal_window": integer(8, MOST_STEPS) | NONE,
@@ -277,7 +277,7 @@ POLICY_ARGUMENTS: dict[str, Kind] = {
     "discount": SHARE,
     "one_pass": FLAG,
     "value_network": FLAG,
-    "causal_abstraction": FLAG,
+    "causal_abstraction": FLAG | choice(["auto"]),
 }
 """Every argument of :class:`~sb3_causalgdp.policies.CausalGDPPolicy`, what goes into ``policy_kwargs`` among them."""
 

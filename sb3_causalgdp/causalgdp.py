@@ -131,9 +131,10 @@ class CausalGDP(AskedAlgorithm, DistilledAlgorithm, CheckedAlgorithm):
         so that an improbable edge carries little. False: as factors on the inputs, which the next layer learns to undo unless
         they are 0
     :param causal_abstraction: Whether actor and critics see only what, by the graphs found in training, can matter for any
-        future reward. Other actions are not modelled: they are the middle of their range plus exploration noise. A dictionary
-        passes arguments to :class:`~sb3_causalgdp.causal.RelevanceGate`, plus ``keep_open``, a list of names of states and
-        actions that are never hidden
+        future reward. Other actions are not modelled: they are the middle of their range plus exploration noise. ``auto`` is
+        True unless there are images, features of your own or a denoiser other than the MLP. A dictionary passes arguments to
+        :class:`~sb3_causalgdp.causal.RelevanceGate`, plus ``keep_open``, a list of names of states and actions that are never
+        hidden
     :param counterfactual_replay: Share of a batch, from 0 to 1, whose transitions exchange parts that, by the graphs found in
         training, do not influence each other: whole components, or what is independent in these states (CoDA,
         https://arxiv.org/abs/2007.02863). Nothing is exchanged before two consecutive graphs can be trusted
@@ -237,7 +238,7 @@ class CausalGDP(AskedAlgorithm, DistilledAlgorithm, CheckedAlgorithm):
         causal_half_life: float | None = None,
         causal_window: int | None = None,
         sample_masks: bool = True,
-        causal_abstraction: bool | dict[str, Any] = False,
+        causal_abstraction: bool | str | dict[str, Any] = "auto",
         counterfactual_replay: float = 0.0,
         state_names: Sequence[str] | None = None,
         action_names: Sequence[str] | None = None,
@@ -390,7 +391,9 @@ class CausalGDP(AskedAlgorithm, DistilledAlgorithm, CheckedAlgorithm):
         own["exploration_noise"] = FloatSchedule(self.exploration_noise)(1.0)
         networks = {"one_pass": self.actor_update == "trust_region", "value_network": self.expectile is not None}
         asked = {name: True for name, is_asked in networks.items() if is_asked}
-        return {**own, "discount": self.gamma, "causal_abstraction": self.causal_abstraction is not False, **asked}
+        # Arguments of the gate ask for one
+        hides = True if isinstance(self.causal_abstraction, dict) else self.causal_abstraction
+        return {**own, "discount": self.gamma, "causal_abstraction": hides, **asked}
 
     def _create_aliases(self) -> None:
         self.actor = self.policy.actor

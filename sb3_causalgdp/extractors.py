@@ -30,13 +30,21 @@ class StandardizedExtractor(BaseFeaturesExtractor):
         self.register_buffer("inverse_std", th.ones(extractor.features_dim))
 
     @staticmethod
-    def covers(extractor: BaseFeaturesExtractor, state_dim: int) -> bool:
+    def may_cover(extractor_class: type[BaseFeaturesExtractor]) -> bool:
+        """
+        :param extractor_class: Class of a features extractor
+        :return: Whether its features are the state variables, where no observation is an image
+        """
+        return extractor_class in (FlattenExtractor, CombinedExtractor)
+
+    @classmethod
+    def covers(cls, extractor: BaseFeaturesExtractor, state_dim: int) -> bool:
         """
         :param extractor: A features extractor
         :param state_dim: Number of state variables of the world model
         :return: Whether its features are these variables
         """
-        return type(extractor) in (FlattenExtractor, CombinedExtractor) and extractor.features_dim == state_dim
+        return cls.may_cover(type(extractor)) and extractor.features_dim == state_dim
 
     def forward(self, observations: PyTorchObs) -> th.Tensor:
         standardized = (self.extractor(observations) - self.mean) * self.inverse_std

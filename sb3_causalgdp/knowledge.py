@@ -52,7 +52,7 @@ class DiscoveringAlgorithm(OfflineToOnlineAlgorithm):
     causal_window: int | None
     state_names: Sequence[str] | None
     action_names: Sequence[str] | None
-    causal_abstraction: bool | dict[str, Any]
+    causal_abstraction: bool | str | dict[str, Any]
     relevance_gate: RelevanceGate | None
     """The verdict on what actor and critics see; None without ``causal_abstraction``."""
     counterfactual_replay: float
@@ -179,7 +179,7 @@ class DiscoveringAlgorithm(OfflineToOnlineAlgorithm):
 
     def _setup_abstraction(self) -> None:
         self.relevance_gate = None
-        if self.causal_abstraction is False:
+        if not self.policy.causal_abstraction:
             self._relevance_verdict = None
             return
         options, keep_open = self._abstraction_options()

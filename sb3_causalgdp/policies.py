@@ -89,7 +89,7 @@ class CausalGDPPolicy(AbstractingPolicy):
         while acting
     :param value_network: Whether the critics include a network V(s)
     :param causal_abstraction: Whether components of observations and actions can be hidden from actor and critics, see
-        :meth:`~sb3_causalgdp.abstraction.AbstractingPolicy.show`
+        :meth:`~sb3_causalgdp.abstraction.AbstractingPolicy.show`; ``auto``: where that works
     """
 
     candidate_noise: th.Tensor
@@ -134,12 +134,16 @@ class CausalGDPPolicy(AbstractingPolicy):
         discount: float = 0.99,
         one_pass: bool = False,
         value_network: bool = False,
-        causal_abstraction: bool = False,
+        causal_abstraction: bool | str = False,
     ) -> None:
         check_arguments(POLICY_ARGUMENTS, locals())
         check_keywords("features_extractor_kwargs", features_extractor_kwargs or {}, features_extractor_class)
         check_keywords("optimizer_kwargs", optimizer_kwargs or {}, optimizer_class)
-        if causal_abstraction and (denoiser != "mlp" or one_pass):
+        gates_actions = denoiser == "mlp" and not one_pass
+        if causal_abstraction == "auto":
+            gates_states = StandardizedExtractor.may_cover(features_extractor_class)
+            causal_abstraction = gates_actions and gates_states and not self._has_images(observation_space, normalize_images)
+        elif causal_abstraction and not gates_actions:
             raise ValueError(
                 f"causal_abstraction must be False where the actor is no denoiser 'mlp', got True with {denoiser!r}"
             )
@@ -178,7 +182,7 @@ class CausalGDPPolicy(AbstractingPolicy):
         self.critic_normalization = critic_normalization
         self.normalize_observations = normalize_observations
         self.share_features_extractor = share_features_extractor
-        self.causal_abstraction = causal_abstraction
+        self.causal_abstraction = bool(causal_abstraction)
         self.world_model_net_arch = world_model_net_arch
         actor_arch, critic_arch = get_actor_critic_arch(self.net_arch)
         shared_kwargs = {
@@ -186,7 +190,7 @@ class CausalGDPPolicy(AbstractingPolicy):
             "action_space": action_space,
             "activation_fn": self.activation_fn,
             "normalize_images": normalize_images,
-            "gates_actions": causal_abstraction,
+            "gates_actions": self.causal_abstraction,
         }
         self.diffusion_kwargs = {
             "diffusion_steps": diffusion_steps,
@@ -215,9 +219,7 @@ class CausalGDPPolicy(AbstractingPolicy):
     def _build(self, lr_schedule: Schedule) -> None:
         # Here, because a compiler cannot see through flatdim()
         self.leaf_sizes = [spaces.flatdim(space) for space in leaf_spaces(self.observation_space)]
-        self.has_image_state = any(
-            is_image_space(space, normalized_image=not self.normalize_images) for space in leaf_spaces(self.observation_space)
-        )
+        self.has_image_state = self._has_images(self.observation_space, self.normalize_images)
         self._acting: NumpyActing | OnePassActing | None = None
         self.register_buffer("reward_target", th.zeros(()))
         self.register_buffer("return_std", th.ones(()))
@@ -247,6 +249,10 @@ class CausalGDPPolicy(AbstractingPolicy):
         self.actor_target.set_training_mode(False)
         if self.critic_target is not self.critic:
             self.critic_target.set_training_mode(False)
+
+    @staticmethod
+    def _has_images(observation_space: spaces.Space, normalize_images: bool) -> bool:
+        return any(is_image_space(space, normalized_image=not normalize_images) for space in leaf_spaces(observation_space))
 
     def _make_optimizers(self, lr_schedule: Schedule) -> None:
         optimizer_kwargs = self.optimizer_kwargs

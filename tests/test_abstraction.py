@@ -8,6 +8,7 @@ from goal_env import GoalEnv
 from gymnasium import spaces
 from small_models import SMALL
 from stable_baselines3 import HerReplayBuffer
+from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize
 
 from sb3_causalgdp import CausalGDP
@@ -491,7 +492,7 @@ def test_options_are_those_of_the_gate():
         ({"low": 2.0}, "causal_abstraction: low and high must be in"),
         ({"keep_open": ["obs[9]"]}, r"causal_abstraction: keep_open must be names among .*, got \['obs\[9\]'\]"),
         ({"keep_open": "obs[1]"}, "causal_abstraction: keep_open must be a list of names"),
-        ("yes", "causal_abstraction must be True or False or a dictionary"),
+        ("yes", "causal_abstraction must be True or False or a dictionary .* or 'auto', got 'yes'"),
     ],
 )
 def test_mistakes_are_named(abstraction, message):
@@ -561,3 +562,44 @@ def test_a_model_without_abstraction_gets_it_and_one_with_it_loses_it():
     np.testing.assert_array_equal(*(again.predict(one, deterministic=True)[0] for one in (rows, others)))
     again.learn(40)
     assert not np.array_equal(*(again.predict(one, deterministic=True)[0] for one in (rows, others)))
+
+
+# The default ------------------------------------------------------------------------------------------------------------
+
+
+def test_by_default_what_does_not_matter_is_hidden():
+    model = CausalGDP("MlpPolicy", Cart(), **SMALL).learn(1000)
+    gates = model.policy.state_gate, model.policy.action_gate
+    assert gates[0][0] == gates[1][0] == 1.0 and gates[0].sum() < N_STATES and gates[1].sum() < N_ACTIONS
+
+
+IMAGE = spaces.Box(0, 255, (1, 36, 36), np.uint8)
+
+
+class OwnFeatures(FlattenExtractor):
+    pass
+
+
+@pytest.mark.parametrize(
+    ("policy", "space", "kwargs"),
+    [
+        ("CnnPolicy", IMAGE, {}),
+        ("MultiInputPolicy", spaces.Dict({"image": IMAGE, "speed": spaces.Box(-1.0, 1.0, (1,))}), {}),
+        ("MlpPolicy", spaces.Box(-1.0, 1.0, (3,)), {"policy_kwargs": {"denoiser": "transformer"}}),
+        ("MlpPolicy", spaces.Box(-1.0, 1.0, (3,)), {"actor_update": "trust_region"}),
+        ("MlpPolicy", spaces.Box(-1.0, 1.0, (3,)), {"policy_kwargs": {"features_extractor_class": OwnFeatures}}),
+    ],
+)
+def test_by_default_all_is_seen_where_nothing_can_be_hidden(policy, space, kwargs):
+    env = gym.make("Pendulum-v1")
+    env.observation_space = space
+    model = CausalGDP(policy, env, **{**SMALL, **kwargs})
+    assert not model.policy.causal_abstraction and model.relevance_gate is None
+
+
+def test_where_everything_matters_the_default_changes_no_number():
+    numbers = [
+        th.cat([p.flatten() for p in CausalGDP("MlpPolicy", "Pendulum-v1", **SMALL, **kwargs).learn(400).policy.parameters()])
+        for kwargs in ({}, {"causal_abstraction": False})
+    ]
+    assert th.equal(*numbers)

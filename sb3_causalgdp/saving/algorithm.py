@@ -193,8 +193,8 @@ class SavedAlgorithm(DiscoveringAlgorithm):
                 values = {**saved.plain, **given}
                 # SB3 replaces only what its own entry names
                 more = {name: value for name, value in values.items() if name in LARGE and name not in saved.named}
-                if "pessimism" not in saved.named:
-                    more["pessimism"] = 1.0
+                first = {"pessimism": 1.0, "causal_abstraction": False}
+                more |= {name: value for name, value in first.items() if name not in saved.named}
                 if "target_policy_noise" not in saved.named:
                     more |= {"_has_first_defaults": True, "target_policy_noise": 0.0}
                 model = super().load(
