@@ -9,7 +9,7 @@ import yaml
 PEERS = ("sac", "td3", "tqc", "crossq")
 VARIANTS: dict[str, dict[str, Any]] = {
     "causalgdp": {},
-    "causalgdp_abstraction": {"causal_abstraction": True},
+    "causalgdp_sees_all": {"causal_abstraction": False},
     "causalgdp_open": {"causal_discovery": "fully_connected"},
     "causalgdp_perturbed": {
         "causal_discovery": "perturbed",
