@@ -6,6 +6,8 @@ from typing import Any
 
 import yaml
 
+from sb3_causalgdp.presets import PRESETS, preset
+
 PEERS = ("sac", "td3", "tqc", "crossq")
 VARIANTS: dict[str, dict[str, Any]] = {
     "causalgdp": {},
@@ -15,6 +17,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
         "causal_discovery": "perturbed",
         "causal_discovery_kwargs": {"method": "partial_r2", "noise": 0.5},
     },
+    **{name: preset(name) for name in PRESETS},
 }
 NAMES = (*VARIANTS, *PEERS)
 
@@ -25,8 +28,8 @@ def make_model(algorithm: str, env: Any, seed: int, **arguments: Any) -> Any:
     :param env: The environments
     :param seed: Seed
     :param arguments: Of the constructor, on top of the settings
-    :return: The model: CausalGDP with its defaults, or with a graph that says nothing or a wrong one, the others with RL Zoo's
-        settings
+    :return: The model: CausalGDP with its defaults, as another method, or with a graph that says nothing or a wrong one, the
+        others with RL Zoo's settings
     """
     own = algorithm in VARIANTS
     settings = dict(VARIANTS[algorithm]) if own else zoo_settings(algorithm, env.get_attr("spec")[0].id)
