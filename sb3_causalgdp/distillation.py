@@ -35,8 +35,12 @@ def distil(
         (DAgger, Ross et al., 2011, https://arxiv.org/abs/1011.0686)
     :return: A copy of the policy that acts by this perceptron
     """
-    student = type(teacher)(**{**teacher._get_constructor_parameters(), "one_pass": True}).to(teacher.device)
+    one_pass = {"one_pass": True, "causal_abstraction": False}
+    student = type(teacher)(**{**teacher._get_constructor_parameters(), **one_pass}).to(teacher.device)
     student.load_state_dict(teacher.state_dict(), strict=False)
+    # What is hidden from the teacher is no sight for the student
+    for actor in (student.actor, student.actor_target):
+        actor.features_extractor.load_state_dict(teacher.actor.features_extractor.state_dict(), strict=False)
     student.set_training_mode(False)
     network = student.actor.one_pass
     examples = _examples(teacher, student, observations)

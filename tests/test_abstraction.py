@@ -597,6 +597,17 @@ def test_by_default_all_is_seen_where_nothing_can_be_hidden(policy, space, kwarg
     assert not model.policy.causal_abstraction and model.relevance_gate is None
 
 
+def test_a_distilled_policy_does_not_see_what_its_teacher_does_not(trained, tmp_path):
+    student = trained.distil(n_observations=100, gradient_steps=20)
+    student.save(tmp_path / "student.zip")
+    seen, otherwise = np.ones(N_STATES), np.ones(N_STATES)
+    otherwise[HIDDEN_STATES] = 7.0
+    for policy in (student, CausalGDPPolicy.load(tmp_path / "student.zip")):
+        actions = [policy.predict(one, deterministic=True)[0] for one in (seen, otherwise, 1.5 * seen)]
+        np.testing.assert_array_equal(actions[0], actions[1])
+        assert not np.array_equal(actions[0], actions[2])
+
+
 def test_where_everything_matters_the_default_changes_no_number():
     numbers = [
         th.cat([p.flatten() for p in CausalGDP("MlpPolicy", "Pendulum-v1", **SMALL, **kwargs).learn(400).policy.parameters()])

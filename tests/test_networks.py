@@ -142,7 +142,9 @@ def test_far_observations_are_cut():
 
 
 def test_observations_stay_as_they_are_when_asked_and_with_an_extractor_of_ones_own():
-    plain = make_model(policy_kwargs={**SMALL["policy_kwargs"], "normalize_observations": False})
+    kwargs = {**SMALL["policy_kwargs"], "normalize_observations": False}
+    assert not make_model(policy_kwargs=kwargs).actor.features_extractor.standardizes
+    plain = make_model(policy_kwargs=kwargs, causal_abstraction=False)
     assert not isinstance(plain.actor.features_extractor, StandardizedExtractor)
 
 
