@@ -39,8 +39,8 @@ def distil(
     student = type(teacher)(**{**teacher._get_constructor_parameters(), **one_pass}).to(teacher.device)
     student.load_state_dict(teacher.state_dict(), strict=False)
     # What is hidden from the teacher is no sight for the student
-    for actor in (student.actor, student.actor_target):
-        actor.features_extractor.load_state_dict(teacher.actor.features_extractor.state_dict(), strict=False)
+    for network in (student.actor, student.actor_target, student.critic, student.critic_target):
+        network.features_extractor.load_state_dict(teacher.actor.features_extractor.state_dict(), strict=False)
     student.set_training_mode(False)
     network = student.actor.one_pass
     examples = _examples(teacher, student, observations)
