@@ -203,7 +203,7 @@ GROUPS: dict[str, dict[str, Kind]] = {
         "bound_penalty": WEIGHT,
         "policy_delay": STEPS,
         "world_model_delay": STEPS,
-        "pessimism": SHARE,
+        "pessimism": SHARE | choice(["auto"]),
         "target_policy_noise": NOISE,
         "target_noise_clip": NOISE,
         "max_q_backup": FLAG,

@@ -98,7 +98,8 @@ class CausalGDP(AskedAlgorithm, DistilledAlgorithm, CheckedAlgorithm):
         many steps, the TD targets of all steps up to the next actor update are computed at once
     :param world_model_delay: The world model is updated once every this many gradient steps
     :param pessimism: How far TD targets go from the mean of the critics, 0, to the smallest of them, 1 (clipped double
-        Q-learning, as in TD3 and SAC). With 1, what the critics disagree by adds up over the discounted horizon
+        Q-learning, as in TD3 and SAC). ``auto`` is 1 in :meth:`pretrain`; in ``learn()`` it begins at 0, or at 1 after
+        pretraining, and follows at each refresh of the graph: up if critics promise more than was obtained, else down
     :param target_policy_noise: Standard deviation of the noise on the actions of TD targets, as in TD3
     :param target_noise_clip: Limit on its absolute value
     :param max_q_backup: Whether the TD target takes the best of ten sampled actions (Diffusion-QL, for AntMaze)
@@ -215,7 +216,7 @@ class CausalGDP(AskedAlgorithm, DistilledAlgorithm, CheckedAlgorithm):
         bound_penalty: float = 0.1,
         policy_delay: int = 3,
         world_model_delay: int = 2,
-        pessimism: float = 0.0,
+        pessimism: float | str = "auto",
         target_policy_noise: float = 0.2,
         target_noise_clip: float = 0.5,
         max_q_backup: bool = False,
@@ -307,6 +308,7 @@ class CausalGDP(AskedAlgorithm, DistilledAlgorithm, CheckedAlgorithm):
         self.policy_delay = policy_delay
         self.world_model_delay = world_model_delay
         self.pessimism = pessimism
+        self.calibrated_pessimism = 0.0
         self.target_policy_noise = target_policy_noise
         self.target_noise_clip = target_noise_clip
         self.max_q_backup = max_q_backup
@@ -431,6 +433,9 @@ class CausalGDP(AskedAlgorithm, DistilledAlgorithm, CheckedAlgorithm):
         if self._waits_for_episode():
             return
         self._trained_normalised = normalised_parts(self._vec_normalize_env)
+        if self.is_pretraining:
+            # Nothing corrects critics that are too hopeful
+            self.calibrated_pessimism = 1.0
         # Switch to train mode (this affects batch norm / dropout)
         self.policy.set_training_mode(True)
         self._update_learning_rates()

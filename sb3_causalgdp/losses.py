@@ -39,7 +39,7 @@ def td_target(
     dones: th.Tensor,
     discounts: th.Tensor | float,
     n_backup_actions: int = 1,
-    pessimism: float = 1.0,
+    pessimism: th.Tensor | float = 1.0,
 ) -> th.Tensor:
     """
     ``y = r + gamma (1 - done) Q'(s', a')``, where Q' is between the mean of the critics and the smallest (clipped double
@@ -56,9 +56,7 @@ def td_target(
     :return: Shape ``(batch, 1)``
     """
     best = th.stack([values.view(-1, n_backup_actions).amax(dim=1) for values in next_q_values])
-    value = best.amin(dim=0)
-    if pessimism < 1.0:
-        value = th.lerp(best.mean(dim=0), value, pessimism)
+    value = th.lerp(best.mean(dim=0), best.amin(dim=0), pessimism)
     return rewards + (1.0 - dones) * discounts * value.unsqueeze(1)
 
 

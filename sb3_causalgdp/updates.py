@@ -65,6 +65,8 @@ class Updates:
         self.actor, self.critic = policy.actor, policy.critic
         self.actor_target, self.critic_target = policy.actor_target, policy.critic_target
         self.batches = Batches(model)
+        # A tensor, so that a change is no other program
+        self.pessimism = th.zeros((), device=model.device)
         networks = (self.actor, self.actor_target, self.critic, self.critic_target, self.world_model)
         # Once, because to visit all modules takes a hundredth of a gradient step
         self._parameters: dict[th.nn.Module, list[th.Tensor]] = {network: [*network.parameters()] for network in networks}
@@ -98,11 +100,12 @@ class Updates:
         # All that the steps depend on and that may change while it trains
         weights = (model.eta, model.denoising_weight, model.bound_penalty, model.q_scale)
         of_methods = (model.expectile, model.advantage_temperature, model.improvement_step)
-        rates = (model.tau, model.gamma, model.max_grad_norm, model.pessimism)
-        noise = (model.target_policy_noise, model.target_noise_clip)
+        rates = (model.tau, model.gamma, model.max_grad_norm, model.target_policy_noise, model.target_noise_clip)
         scales = (self.policy.state_guidance_scale, self.policy.outcome_guidance_scale, self.world_model.n_modelled)
+        is_auto = model.pessimism == "auto"
+        self.pessimism.fill_(model.calibrated_pessimism if is_auto else model.pessimism)
         with n_threads_at_most(model.torch_threads, self.policy.has_image_state):
-            yield self.fast.made_fast(gradient_steps, (weights, of_methods, rates, noise, scales))
+            yield self.fast.made_fast(gradient_steps, (weights, of_methods, rates, scales))
 
     def planned(self, gradient_steps: int, batch_size: int) -> Iterator[tuple[tuple[StepPlan, ...], list[Any]]]:
         """
@@ -171,7 +174,7 @@ class Updates:
         """
         with th.no_grad():
             of_batch = (replay_data.rewards, replay_data.dones, self.discounts(replay_data))
-            return td_target(next_q_values, *of_batch, n_actions, self.model.pessimism)
+            return td_target(next_q_values, *of_batch, n_actions, self.pessimism)
 
     def discounts(self, replay_data) -> th.Tensor | float:
         """

@@ -13,6 +13,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.type_aliases import PyTorchObs
 
+from sb3_causalgdp.callbacks.calibration import FEWEST_HORIZONS, QErrors, calibrated
 from sb3_causalgdp.callbacks.diagnostics import (
     choice,
     dead_units,
@@ -46,7 +47,8 @@ class CausalWorldModelCallback(BaseCallback):
     FEED_ROWS = 10_000
     FEED_IMAGE_ROWS = 256
     HISTORY_ROWS = 20_000
-    RETURN_POSITIONS = 5_000
+    RETURN_POSITIONS = 2_000
+    RETURNS_COMPARED = 256
     OFFLINE_HISTORY_ROWS = 100_000
     ENDS_COMPARED = 2_000
 
@@ -89,6 +91,7 @@ class CausalWorldModelCallback(BaseCallback):
         """
         model = self.model
         start = time.perf_counter()
+        self._calibrate_critics()
         self._feed_statistics()
         model._steps_since_refresh = 0
         variables, statistics = model.transition_variables, model.causal_statistics
@@ -272,29 +275,41 @@ class CausalWorldModelCallback(BaseCallback):
             norm = gradient_norm(module.optimizer)
             if norm is not None:
                 self.logger.record(f"train/{name}_gradient_norm", norm)
-        self._log_q_error()
         if model.policy.is_guided:
             self._log_guidance(observations)
 
-    def _log_q_error(self) -> None:
-        """How far the critics are from what was obtained in the newest episodes."""
+    def _calibrate_critics(self) -> None:
+        """Log how far the critics are from what was obtained in the newest episodes, and let TD targets make up for it."""
+        model, errors = self.model, self._q_errors()
+        if errors is None:
+            return
+        self.logger.record("policy/q_error", errors.of_smallest)
+        if model.pessimism != "auto":
+            return
+        discount = model.gamma**model.n_steps
+        if model._n_updates * (1.0 - discount) >= FEWEST_HORIZONS:
+            model.calibrated_pessimism = calibrated(model.calibrated_pessimism, errors, discount)
+        self.logger.record("train/pessimism", model.calibrated_pessimism)
+
+    def _q_errors(self) -> QErrors | None:
+        """None where no return is known."""
         model, buffer = self.model, self.model.replay_buffer
         if model.is_pretraining or buffer is model.offline_buffer or not buffer.handle_timeout_termination:
-            return
+            return None
         n_positions = min(buffer.size(), self.RETURN_POSITIONS)
         positions = np.arange(buffer.pos - n_positions, buffer.pos) % buffer.buffer_size
         rewards = buffer._normalize_reward(buffer.rewards[positions], model._vec_normalize_env)
         returns = discounted_returns(rewards, buffer.dones[positions], buffer.timeouts[positions], model.gamma)
         known = np.argwhere(~np.isnan(returns))
         if len(known) == 0:
-            return
-        chosen = known[np.linspace(0, len(known) - 1, min(len(known), self.diagnostics_batch_size)).astype(int)]
+            return None
+        chosen = known[np.linspace(0, len(known) - 1, min(len(known), self.RETURNS_COMPARED)).astype(int)]
         rows, envs = positions[chosen[:, 0]], chosen[:, 1]
         observations = self._observations_at(buffer, rows, envs)
+        model.policy.set_training_mode(False)
         with th.no_grad():
-            values = model.policy.critic_target.smallest(observations, buffer.to_torch(buffer.actions[rows, envs]))
-        error = values.flatten().cpu().numpy() - returns[chosen[:, 0], chosen[:, 1]]
-        self.logger.record("policy/q_error", float(error.mean()))
+            values = model.policy.critic_target(observations, buffer.to_torch(buffer.actions[rows, envs]))
+        return QErrors.of(th.cat(values, dim=1).cpu().numpy(), returns[chosen[:, 0], chosen[:, 1]])
 
     def _log_guidance(self, observations: PyTorchObs) -> None:
         model = self.model
