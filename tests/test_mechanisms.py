@@ -240,7 +240,8 @@ def test_refreshes_count_the_steps_of_all_environments():
 def disagreeing():
     """A model whose actor and moving average, and whose critics, have nothing in common."""
     model = CausalGDP("MlpPolicy", "Pendulum-v1", **WITH_TARGET_CRITICS)
-    model.target_policy_noise, model.pessimism = 0.0, 1.0
+    model.target_policy_noise = 0.0
+    model._updates.pessimism.fill_(1.0)
     th.manual_seed(0)
     with th.no_grad():
         for module in (model.actor, model.actor_target, model.critic, *model.critic_target.q_networks):
@@ -283,9 +284,9 @@ def test_td_target_is_the_smallest_target_critic_at_the_moving_averages_action(d
 
 
 @th.no_grad()
-def test_by_default_the_td_target_is_the_mean_of_the_critics(disagreeing):
+def test_without_pessimism_the_td_target_is_the_mean_of_the_critics(disagreeing):
     model, data = disagreeing
-    model.pessimism = CausalGDP("MlpPolicy", "Pendulum-v1", **WITH_TARGET_CRITICS).pessimism
+    model._updates.pessimism.zero_()
     next_actions, target = model._updates.bootstrap(data)
     mean = sum(model.critic_target(data.next_observations, next_actions)) / 2
     th.testing.assert_close(target, data.rewards + (1.0 - data.dones) * model.gamma * mean)

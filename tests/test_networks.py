@@ -44,7 +44,9 @@ def test_both_actions_are_judged_in_one_batch_and_the_second_is_the_target_of_th
         # Neither is what it would be without the other
         values = [of_one.split(64) for of_one in model.critic(*both)]
         alone = model.critic(data.observations, data.actions)
-    target = td_target([second for _, second in values], data.rewards, data.dones, model.gamma, pessimism=model.pessimism)
+    target = td_target(
+        [second for _, second in values], data.rewards, data.dones, model.gamma, pessimism=model._updates.pessimism
+    )
     expected = critic_loss([first for first, _ in values], target)
     with model.critic.batch_statistics():
         _, loss, gradients = model._updates.critic_gradients(data, next_actions)

@@ -1,10 +1,10 @@
 from itertools import pairwise
 
-import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
+from ones import Ones
 from small_models import SMALL
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
@@ -173,21 +173,6 @@ def test_gradient_norms_are_those_of_the_last_updates():
         optimizer.step()
     assert gradient_norm(optimizer) == pytest.approx((25.0 / 2.0) ** 0.5, rel=1e-2)
     assert gradient_norm(th.optim.SGD(network.parameters(), lr=0.1)) is None
-
-
-class Ones(gym.Env):
-    """A reward of 1 in each of ten steps, and the time that is left to be seen."""
-
-    observation_space, action_space = spaces.Box(0.0, 1.0, (1,)), spaces.Box(-1.0, 1.0, (1,))
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.left = 10
-        return np.array([1.0], np.float32), {}
-
-    def step(self, action):
-        self.left -= 1
-        return np.array([self.left / 10], np.float32), 1.0, self.left == 0, False, {}
 
 
 def test_the_error_of_q_is_logged_and_is_that_of_the_critics():

@@ -145,7 +145,7 @@ def test_every_logged_key_has_a_row_and_every_row_a_key(monkeypatch):
     assert ours - rows == set(), "docs/guide/callbacks.md lacks these"
     # By a callback of its own, tests/offline/test_scores.py, by a preset, tests/test_presets.py, and by longer trainings,
     # tests/callbacks/test_diagnostics.py, tests/test_abstraction.py and tests/test_counterfactual.py
-    of_others = {"policy/q_error", "train/actor_gradient_norm"}
+    of_others = {"policy/q_error", "train/pessimism", "train/actor_gradient_norm"}
     of_others |= {"causal/n_components", "causal/exchanged_share"}
     assert rows - recorded == {"eval/normalized_score", "train/trust_region_loss"} | of_others
 
