@@ -35,29 +35,38 @@ def trained(*values, n_steps=200, **kwargs):
 
 def test_errors_are_those_of_the_mean_and_of_the_smallest():
     errors = QErrors.of(np.array([[1.0, 3.0], [8.0, 4.0]]), np.array([1.0, 5.0]))
-    assert errors == (1.0, -0.5, 1.5)
+    assert errors == (1.0, -0.5, 1.5, 3.0)
 
 
 def test_a_step_moves_q_by_a_quarter_of_its_error():
-    errors = QErrors(of_mean=4.0, of_smallest=0.0, gap=0.4)
+    errors = QErrors(of_mean=4.0, of_smallest=0.0, gap=0.4, obtained=0.0)
     moved = calibrated(0.5, errors, DISCOUNT) - 0.5
     # Each backup takes off that much more of the gap, and a hundred of them count
     assert moved * errors.gap / (1.0 - DISCOUNT) == pytest.approx(0.25 * errors.of_mean)
     assert calibrated(0.5, errors._replace(of_mean=-4.0), DISCOUNT) == pytest.approx(0.5 - moved)
 
 
+@pytest.mark.parametrize("obtained", [-20.0, 20.0])
+def test_a_tenth_more_than_was_obtained_is_right(obtained):
+    errors = QErrors(of_mean=2.0, of_smallest=0.0, gap=0.1, obtained=obtained)
+    assert calibrated(0.5, errors, DISCOUNT) == pytest.approx(0.5)
+    assert (
+        calibrated(0.5, errors._replace(of_mean=1.0), DISCOUNT) < 0.5 < calibrated(0.5, errors._replace(of_mean=3.0), DISCOUNT)
+    )
+
+
 @pytest.mark.parametrize(("of_mean", "expected"), [(1e9, 0.75), (-1e9, 0.25), (0.0, 0.5)])
 def test_no_step_is_longer_than_a_quarter(of_mean, expected):
-    assert calibrated(0.5, QErrors(of_mean, of_mean, 1.0), DISCOUNT) == pytest.approx(expected)
+    assert calibrated(0.5, QErrors(of_mean, of_mean, 1.0, 0.0), DISCOUNT) == pytest.approx(expected)
 
 
 @pytest.mark.parametrize(("pessimism", "of_mean"), [(0.9, 1e9), (0.1, -1e9)])
 def test_it_stays_between_the_mean_and_the_smallest(pessimism, of_mean):
-    assert calibrated(pessimism, QErrors(of_mean, of_mean, 1.0), DISCOUNT) == float(of_mean > 0)
+    assert calibrated(pessimism, QErrors(of_mean, of_mean, 1.0, 0.0), DISCOUNT) == float(of_mean > 0)
 
 
 def test_critics_that_agree_change_nothing():
-    assert calibrated(0.3, QErrors(5.0, 5.0, 0.0), DISCOUNT) == 0.3
+    assert calibrated(0.3, QErrors(5.0, 5.0, 0.0, 0.0), DISCOUNT) == 0.3
 
 
 @pytest.mark.parametrize(("values", "expected"), [((9.0, 10.0), 1.0), ((-9.0, -10.0), 0.0)])
