@@ -39,9 +39,9 @@ class QErrors(NamedTuple):
 
 def calibrated(pessimism: float, errors: QErrors, discount: float) -> float:
     """
-    A damped Newton step towards critics that promise a tenth more than was obtained: the gap between the critics' mean and the smallest enters each TD target, so that a change of the
-    pessimism moves Q by the gap times the discounted horizon (calibrating by recent returns is ACC's idea, Dorka et al., 2021,
-    https://arxiv.org/abs/2111.12673).
+    A damped Newton step towards critics that promise a tenth more than was obtained. The gap between the critics' mean and the
+    smallest enters each TD target, so that a change of the pessimism moves Q by the gap times the discounted horizon.
+    Calibrating by recent returns is ACC's idea (Dorka et al., 2021, https://arxiv.org/abs/2111.12673).
 
     :param pessimism: That of the TD targets until now, in [0, 1]
     :param errors: Of the newest transitions
