@@ -517,7 +517,42 @@ def draw_noise_schedules() -> Figure:
     return figure
 
 
+# What causal abstraction earns ------------------------------------------------------------------------------------------
+
+BENCHMARKS = FOLDER.parents[1] / "benchmarks"
+# Of each panel: title, and for each curve the files' names and what they are
+DISTRACTION = {
+    "HalfCheetah-v5 with 100 noise observations": {
+        "causal/results/HalfCheetah-v5_smallest_m100_k0": ("CausalGDP, sees what matters", BLUE),
+        "causal/results/HalfCheetah-v5_smallest-sees-all_m100_k0": ("CausalGDP, sees everything", RED),
+        "causal/results/HalfCheetah-v5_sac_m100_k0": ("SAC", GREY),
+    },
+    "Ant-v5 (105 observations)": {
+        "learning/results/Ant-v5_smallest-abstraction": ("CausalGDP, sees what matters", BLUE),
+        "learning/results/Ant-v5_smallest": ("CausalGDP, sees everything", RED),
+    },
+}
+
+
+def draw_distractors() -> Figure:
+    """One line for each seed of the learning benchmark."""
+    figure = new_figure(8.4, 3.2)
+    for index, (title, curves) in enumerate(DISTRACTION.items()):
+        axes = figure.add_subplot(1, 2, index + 1)
+        for files, (label, colour) in curves.items():
+            for number, path in enumerate(sorted(BENCHMARKS.glob(f"{files}_[0-9].csv"))):
+                steps, returns = np.loadtxt(path, delimiter=",", skiprows=1, usecols=(0, 1), unpack=True)
+                axes.plot(steps / 1000, returns, color=colour, label=label if number == 0 else None)
+        axes.set_title(title, fontsize=10)
+        axes.set_xlabel("environment steps (thousands)", fontsize=9)
+        axes.spines[["top", "right"]].set_visible(False)
+    figure.axes[0].set_ylabel("return", fontsize=9)
+    figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=3, fontsize=8, frameon=False)
+    return figure
+
+
 FIGURES: dict[str, Callable[[], Figure]] = {
+    "distractors": draw_distractors,
     "data_flow": draw_data_flow,
     "denoising_chain": draw_denoising_chain,
     "guidance_error": draw_guidance_error,
