@@ -15,7 +15,8 @@ LAYERS = [
     {"saving.algorithm", "callbacks.pictures"},
     {"callbacks", "checkpoints", "knowledge"},
     {"callbacks.world_model", "updates"},
-    {"losses", "batches", "distillation", "callbacks.diagnostics", "questions", "acceleration.fast_steps", "step_plans"},
+    {"losses", "batches", "distillation", "callbacks.diagnostics", "callbacks.calibration", "questions"}
+    | {"acceleration.fast_steps", "step_plans"},
     {"policies", "counterfactual", "acceleration.device_replay", "acceleration.cuda_graphs", "acceleration.gradients"},
     {"export", "abstraction"},
     {"steering"},
