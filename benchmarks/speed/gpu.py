@@ -22,7 +22,7 @@ from benchmarks.speed.benchmark import HALF_CHEETAH, ROWS
 from benchmarks.speed.data import collect, save
 from benchmarks.speed.results import markdown
 from benchmarks.speed.workers.causalgdp import CausalGDPContestant
-from benchmarks.speed.workers.matmuls import count_flops
+from benchmarks.speed.workers.matmuls import CYCLE, count_flops
 from sb3_causalgdp import CausalGDP
 from sb3_causalgdp.acceleration.cuda_graphs import record
 
@@ -134,10 +134,10 @@ def floors(contestant: CausalGDPContestant, device: str) -> dict[str, float]:
     x, weight, tiny = th.randn(256, 256, device=device), th.randn(256, 256, device=device), th.zeros(1, device=device)
     result = th.empty_like(x)
     product = per_launch(lambda: th.mm(x, weight, out=result), device, recorded=True)
-    flops = count_flops(lambda: contestant.update(2))["total"] / 2
+    flops = count_flops(lambda: contestant.update(CYCLE))["total"] / CYCLE
     with th.profiler.profile() as profiler:
-        contestant.update(2)
-    launches = sum(event.count for event in profiler.key_averages() if event.key.startswith("cudaLaunchKernel")) / 2
+        contestant.update(CYCLE)
+    launches = sum(event.count for event in profiler.key_averages() if event.key.startswith("cudaLaunchKernel")) / CYCLE
     return {
         "ms of products": 1e3 * flops / (2 * 256**3) * product,
         "ms of launches": 1e3 * launches * per_launch(lambda: tiny.add_(1.0), device, recorded=False),

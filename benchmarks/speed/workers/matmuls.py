@@ -30,6 +30,9 @@ class ProductRecorder(TorchDispatchMode):
         return func(*args, **(kwargs or {}))
 
 
+CYCLE = 6  # updates after which the delays of actors and world models begin anew
+
+
 def count_flops(update: Callable[[], Any]) -> dict[str, int]:
     """
     :param update: Makes one update

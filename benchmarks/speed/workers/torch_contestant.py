@@ -17,14 +17,15 @@ class _Updates(Protocol):
 class TorchContestant:
     """Floating point operations and matrix products of one update; the rate of the machine's own."""
 
-    # Means over two updates: TD3's actor has only every second one
+    # Means over a cycle: TD3's actor has every second update, CausalGDP's every third
     def flops(self: _Updates) -> dict[str, float]:
         """Floating point operations of one update."""
-        return {name: count / 2 for name, count in matmuls.count_flops(lambda: self.update(2)).items()}
+        return {name: count / matmuls.CYCLE for name, count in matmuls.count_flops(lambda: self.update(matmuls.CYCLE)).items()}
 
     def products(self: _Updates) -> dict[str, float]:
         """Seconds of one update's matrix products, each layout alone."""
-        return {name: value / 2 for name, value in matmuls.products_alone(lambda: self.update(2)).items()}
+        alone = matmuls.products_alone(lambda: self.update(matmuls.CYCLE))
+        return {name: value / matmuls.CYCLE for name, value in alone.items()}
 
     def layer_rates(self, shapes: list[tuple[int, int, int]]) -> dict[str, Any]:
         """
