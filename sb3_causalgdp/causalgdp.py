@@ -216,7 +216,7 @@ class CausalGDP(AskedAlgorithm, DistilledAlgorithm, CheckedAlgorithm):
         bound_penalty: float = 0.1,
         policy_delay: int = 3,
         world_model_delay: int = 2,
-        pessimism: float | str = "auto",
+        pessimism: float | str = 1.0,
         target_policy_noise: float = 0.2,
         target_noise_clip: float = 0.5,
         max_q_backup: bool = False,

@@ -523,13 +523,13 @@ BENCHMARKS = FOLDER.parents[1] / "benchmarks"
 # Of each panel: title, and for each curve the files' names and what they are
 DISTRACTION = {
     "HalfCheetah-v5 with 100 noise observations": {
-        "causal/results/HalfCheetah-v5_smallest_m100_k0": ("CausalGDP, sees what matters", BLUE),
-        "causal/results/HalfCheetah-v5_smallest-sees-all_m100_k0": ("CausalGDP, sees everything", RED),
+        "causal/results/HalfCheetah-v5_causalgdp_m100_k0": ("CausalGDP, sees what matters", BLUE),
+        "causal/results/HalfCheetah-v5_causalgdp_sees_all_m100_k0": ("CausalGDP, sees everything", RED),
         "causal/results/HalfCheetah-v5_sac_m100_k0": ("SAC", GREY),
     },
     "Ant-v5 (105 observations)": {
-        "learning/results/Ant-v5_smallest-abstraction": ("CausalGDP, sees what matters", BLUE),
-        "learning/results/Ant-v5_smallest": ("CausalGDP, sees everything", RED),
+        "learning/results/Ant-v5_causalgdp": ("CausalGDP, sees what matters", BLUE),
+        "learning/results/Ant-v5_causalgdp_sees_all": ("CausalGDP, sees everything", RED),
     },
 }
 

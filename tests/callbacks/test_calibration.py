@@ -29,7 +29,11 @@ class Saying(BaseCallback):
 
 def trained(*values, n_steps=200, **kwargs):
     """On rewards of 1 in ten steps, of which 5.4 are obtained in the mean."""
-    model = CausalGDP("MlpPolicy", Ones(), **{**SMALL, "train_freq": 1, "causal_refresh_freq": 20, "gamma": 0.5, **kwargs})
+    model = CausalGDP(
+        "MlpPolicy",
+        Ones(),
+        **{**SMALL, "train_freq": 1, "causal_refresh_freq": 20, "gamma": 0.5, "pessimism": "auto", **kwargs},
+    )
     return model.learn(n_steps, callback=[Saying(*values), CausalWorldModelCallback(min_transitions=10**6)])
 
 
@@ -92,7 +96,7 @@ def test_pretraining_takes_the_smallest_and_what_was_calibrated_is_saved(tmp_pat
     source = CausalGDP("MlpPolicy", Ones(), **SMALL).learn(40)
     assert source.calibrated_pessimism == 0.0
     source.save_replay_buffer(tmp_path / "buffer")
-    model = CausalGDP("MlpPolicy", Ones(), **SMALL)
+    model = CausalGDP("MlpPolicy", Ones(), pessimism="auto", **SMALL)
     model.preload(tmp_path / "buffer.npz")
     model.pretrain(2)
     assert model.calibrated_pessimism == 1.0
