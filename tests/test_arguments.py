@@ -97,6 +97,19 @@ def test_wild_values_of_the_policy_are_refused_by_name_or_right(name):
     assert sum(refused) >= len(WILD) // 3
 
 
+def a_word(progress):
+    return "fast"
+
+
+def less_than_nothing(progress):
+    return -progress
+
+
+def name_of(value):
+    """Without addresses, which each process has others of."""
+    return value if isinstance(value, str) else getattr(value, "__name__", repr(value))
+
+
 @pytest.mark.parametrize(
     "kwargs",
     [
@@ -111,8 +124,8 @@ def test_wild_values_of_the_policy_are_refused_by_name_or_right(name):
         {"max_grad_norm": float("nan")},
         {"exploration_noise": 1e9},
         {"learning_starts": -1},
-        {"learning_rate": lambda progress: "fast"},
-        {"learning_rate": lambda progress: -progress},
+        {"learning_rate": a_word},
+        {"learning_rate": less_than_nothing},
         {"train_freq": 0},
         {"train_freq": (1, "year")},
         {"train_freq": (1, "step", 2)},
@@ -132,7 +145,7 @@ def test_wild_values_of_the_policy_are_refused_by_name_or_right(name):
         {"buffer_size": 1, "optimize_memory_usage": True, "replay_buffer_kwargs": {"handle_timeout_termination": False}},
         {"n_steps": 3, "buffer_size": 2},
     ],
-    ids=lambda kwargs: f"{next(iter(kwargs))}={next(iter(kwargs.values()))!r}"[:40],
+    ids=lambda kwargs: "=".join(name_of(part) for part in next(iter(kwargs.items())))[:40],
 )
 def test_what_makes_no_sense_is_refused_by_name(kwargs):
     with pytest.raises(ValueError, match=rf"{next(iter(kwargs))}( must be|: )"):
