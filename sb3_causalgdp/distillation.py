@@ -37,10 +37,9 @@ def distil(
     """
     one_pass = {"one_pass": True, "causal_abstraction": False}
     student = type(teacher)(**{**teacher._get_constructor_parameters(), **one_pass}).to(teacher.device)
-    student.load_state_dict(teacher.state_dict(), strict=False)
-    # What is hidden from the teacher is no sight for the student
-    for network in (student.actor, student.actor_target, student.critic, student.critic_target):
-        network.features_extractor.load_state_dict(teacher.actor.features_extractor.state_dict(), strict=False)
+    # Without the gates, what is hidden from the teacher is not shown again
+    own = {name: value for name, value in teacher.state_dict().items() if name not in ("state_gate", "action_gate")}
+    student.load_state_dict(own, strict=False)
     student.set_training_mode(False)
     network = student.actor.one_pass
     examples = _examples(teacher, student, observations)

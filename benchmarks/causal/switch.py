@@ -18,10 +18,10 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from sb3_causalgdp.callbacks import CausalWorldModelCallback
 from sb3_causalgdp.causal import CausalGraph, TransitionVariables, make_discovery, make_statistics
 
 CHANGES = ("action", "sensor", "distractor")
-HISTORY_ROWS = 20_000
 
 
 class Swapped(gym.Wrapper):
@@ -118,7 +118,7 @@ def follow(
         if statistics.wants_history:
             # As the callback does it
             statistics.restart()
-            n_held = min(end, window or HISTORY_ROWS, statistics.rows_since_change)
+            n_held = min(end, window or CausalWorldModelCallback.HISTORY_ROWS, statistics.rows_since_change)
             statistics.refill(rows[end - int(n_held) : end])
         graph = discovery(statistics, variables, graph)
         if end == at_step:

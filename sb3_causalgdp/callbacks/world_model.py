@@ -90,8 +90,9 @@ class CausalWorldModelCallback(BaseCallback):
         Feed, discover and write the masks now.
         """
         model = self.model
+        if model.pessimism == "auto" or self.diagnostics_batch_size > 0:
+            self._calibrate_critics()
         start = time.perf_counter()
-        self._calibrate_critics()
         self._feed_statistics()
         model._steps_since_refresh = 0
         variables, statistics = model.transition_variables, model.causal_statistics
