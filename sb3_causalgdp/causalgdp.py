@@ -364,6 +364,10 @@ class CausalGDP(AskedAlgorithm, DistilledAlgorithm, CheckedAlgorithm):
         if self.num_timesteps > 0 and self.seed is not None:
             # A loaded model would live through the random numbers and start states of its first steps again
             self.set_random_seed(fresh_seed(self))
+        if self.pessimism == "auto" and self.policy.n_critics == 1:
+            raise ValueError(
+                "pessimism must be a number with n_critics=1, got 'auto': one critic is its own mean and smallest"
+            )
         if self.policy.critic.normalizes_batches:
             for name, without in (("max_q_backup", False), ("expectile", None)):
                 value = getattr(self, name)

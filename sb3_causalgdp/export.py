@@ -61,20 +61,21 @@ def export_policy(
     :raises RuntimeError: If the file gives other actions than ``predict``
     """
     path = Path(path)
-    if path.suffix not in _WRITERS:
+    suffix = path.suffix.lower()
+    if suffix not in _WRITERS:
         raise ValueError(f"path must end in one of {sorted(_WRITERS)}, got {str(path)!r}")
-    if path.suffix == ".onnx":
+    if suffix == ".onnx":
         _need_onnx()
     guided = policy.is_guided if guided is None else guided
     if guided and not policy.is_guided:
         raise ValueError("guided must be False or None before the causal graph is found and without guidance, got True")
     acting = ExportedPolicy(policy, guided, deterministic, vec_normalize)
     arrays, actions = acting.examples()
-    program = _traced(acting, arrays, keeps_solver=path.suffix != ".onnx")
+    program = _traced(acting, arrays, keeps_solver=suffix != ".onnx")
     _check_same(acting, actions, program(*map(th.as_tensor, arrays)).numpy())
     metadata = json.dumps(acting.metadata(variables), indent=1)
     with replaced_when_done(path) as temporary, _quiet():
-        exported = _WRITERS[path.suffix](program, acting, arrays, metadata, temporary)
+        exported = _WRITERS[suffix](program, acting, arrays, metadata, temporary)
         if exported is not None:
             _check_same(acting, actions, exported(arrays))
 

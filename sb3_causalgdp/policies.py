@@ -144,8 +144,9 @@ class CausalGDPPolicy(AbstractingPolicy):
             gates_states = StandardizedExtractor.may_cover(features_extractor_class)
             causal_abstraction = gates_actions and gates_states and not self._has_images(observation_space, normalize_images)
         elif causal_abstraction and not gates_actions:
+            what = "a policy that acts in one pass" if one_pass else f"denoiser={denoiser!r}"
             raise ValueError(
-                f"causal_abstraction must be False where the actor is no denoiser 'mlp', got True with {denoiser!r}"
+                f"causal_abstraction must be 'auto' or False with {what}, got True: it hides inputs of the denoiser 'mlp'"
             )
         super().__init__(
             observation_space,

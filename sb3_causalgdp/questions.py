@@ -17,6 +17,7 @@ from sb3_causalgdp.causal import (
     TransitionVariables,
 )
 from sb3_causalgdp.causal.interventions import ActionRule
+from sb3_causalgdp.causal.rows import as_numbers
 from sb3_causalgdp.causal.world_model import MaskedWorldModel
 from sb3_causalgdp.offline.algorithm import OfflineToOnlineAlgorithm
 from sb3_causalgdp.policies import CausalGDPPolicy
@@ -195,7 +196,7 @@ def actions_of(policy: CausalGDPPolicy, action: npt.ArrayLike) -> np.ndarray:
     :return: Flattened, shape ``(d,)`` for one action, else ``(batch, d)``
     :raises ValueError: If the shape is not that of the action space
     """
-    actions, shape = np.asarray(action, dtype=np.float64), policy.action_space.shape
+    actions, shape = as_numbers("actions", action), policy.action_space.shape
     assert shape is not None
     if actions.shape == shape:
         return actions.flatten()

@@ -144,6 +144,9 @@ def name_of(value):
         {"causal_discovery_kwargs": {"threshold": "low"}},
         {"buffer_size": 1, "optimize_memory_usage": True, "replay_buffer_kwargs": {"handle_timeout_termination": False}},
         {"n_steps": 3, "buffer_size": 2},
+        {"pessimism": "auto", **in_policy(n_critics=1)},
+        {"causal_abstraction": True, **in_policy(denoiser="transformer")},
+        {"causal_abstraction": True, "actor_update": "trust_region"},
     ],
     ids=lambda kwargs: "=".join(name_of(part) for part in next(iter(kwargs.items())))[:40],
 )
@@ -193,7 +196,7 @@ def test_numbers_of_numpy_become_pythons():
 
 def test_what_load_brings_is_checked_too(tmp_path):
     make().save(tmp_path / "model")
-    with pytest.raises(ValueError, match=r"policy_delay must be an integer from 1 to 1,000,000,000, got 0"):
+    with pytest.raises(ValueError, match=r"^policy_delay must be an integer from 1 to 1,000,000,000, got 0"):
         CausalGDP.load(tmp_path / "model", policy_delay=0)
     assert CausalGDP.load(tmp_path / "model", policy_delay=np.int64(3)).policy_delay == 3
 

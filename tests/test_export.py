@@ -270,6 +270,14 @@ def test_images(tmp_path):
 # Refused ----------------------------------------------------------------------------------------------------------------
 
 
+def test_a_suffix_may_be_in_capitals_and_an_untrained_model_is_noted(observations, tmp_path):
+    model = CausalGDP("MlpPolicy", "Pendulum-v1", **SMALL)
+    with pytest.warns(UserWarning, match="The model has not been trained"):
+        model.export(tmp_path / "policy.PT")
+    actions, _ = model.predict(observations, deterministic=True)
+    np.testing.assert_allclose(th.jit.load(tmp_path / "policy.PT")(th.as_tensor(observations)), actions, atol=TOLERANCE)
+
+
 def test_what_cannot_be_exported_is_refused_and_nothing_written(pendulum, tmp_path):
     with pytest.raises(ValueError, match=r"path must end in one of \['.onnx', '.pt', '.pt2'\], got 'policy.h5'"):
         pendulum.export("policy.h5")

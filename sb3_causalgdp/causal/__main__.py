@@ -128,7 +128,10 @@ def main(argv: Sequence[str] | None = None) -> None:
     :param argv: Its arguments, by default those of the process
     """
     parser = make_parser()
-    arguments = parser.parse_args(argv)
+    arguments, unknown = parser.parse_known_args(argv)
+    if unknown:
+        hint = "" if unknown[0].startswith("-") else "; several names are separated by commas, like --state level,temperature"
+        parser.error(f"unrecognized arguments: {' '.join(unknown)}{hint}")
     try:
         run(arguments)
     except (ValueError, OSError, ImportError) as error:

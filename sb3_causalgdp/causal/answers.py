@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from sb3_causalgdp.causal.answers_in_words import counterfactual_in_words, effects_in_words, intervention_in_words
 from sb3_causalgdp.causal.drawing import frame_of, picture
 from sb3_causalgdp.causal.variables import TransitionVariables
 
@@ -18,7 +19,7 @@ RAW = "units of the outcome per unit of the action"
 STANDARDISED = "standard deviations of the outcome per half range of the action"
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class InterventionalDistribution:
     """
     Gaussian next state and reward under do(...); for one observation without the axis of the batch. It can be unpacked into
@@ -44,6 +45,9 @@ class InterventionalDistribution:
     def __iter__(self) -> Iterator[np.ndarray]:
         return iter((self.next_state, self.next_state_std, self.reward, self.reward_std))
 
+    def __repr__(self) -> str:
+        return intervention_in_words(self)
+
     def __getitem__(self, name: Any) -> Any:
         """
         :param name: A next state, such as ``"velocity'"``, or ``"reward"``; or a number, as of a tuple
@@ -56,10 +60,12 @@ class InterventionalDistribution:
         if name not in names:
             raise KeyError(f"unknown outcome {name!r}, known are {names}")
         column = names.index(name)
-        return tuple(values[..., column] for values in self._columns())
+        return tuple(values[..., column] for values in self.columns())
 
-    def _columns(self) -> tuple[np.ndarray, np.ndarray]:
-        """Means and standard deviations of s' and r side by side, shape ``(batch, n + 1)``."""
+    def columns(self) -> tuple[np.ndarray, np.ndarray]:
+        """
+        :return: means and standard deviations of s' and, last, of r side by side, shape ``(batch, n + 1)``
+        """
         means = np.concatenate([self.next_state, np.asarray(self.reward)[..., None]], axis=-1)
         stds = np.concatenate([self.next_state_std, np.asarray(self.reward_std)[..., None]], axis=-1)
         return means, stds
@@ -70,8 +76,8 @@ class InterventionalDistribution:
             what they are without the intervention, and the change in those units and in running standard deviations
         :raises ImportError: when pandas is missing
         """
-        means, stds = (np.atleast_2d(values) for values in self._columns())
-        before = means if self.without is None else np.atleast_2d(self.without._columns()[0])
+        means, stds = (np.atleast_2d(values) for values in self.columns())
+        before = means if self.without is None else np.atleast_2d(self.without.columns()[0])
         names = (*self.variables.next_state_names, "reward")
         rows = []
         for row in range(len(means)):
@@ -111,7 +117,7 @@ class EffectStatistics(NamedTuple):
         return EffectStatistics(*(values * factor for values in self))
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class ActionEffects:
     """
     Total causal effect of each action component on the reward and on each next state variable.
@@ -139,6 +145,14 @@ class ActionEffects:
     n_observations: int
     is_standardised: bool = False
 
+    def __repr__(self) -> str:
+        return effects_in_words(self, self.unit)
+
+    @property
+    def unit(self) -> str:
+        """Of the numbers."""
+        return STANDARDISED if self.is_standardised else RAW
+
     def standardised(self) -> "ActionEffects":
         """
         :return: The effects in running standard deviations of the outcome for half of the action's range, so that actions and
@@ -162,13 +176,12 @@ class ActionEffects:
             and ``through the next state``; ``unit`` says whether the numbers are standardised
         :raises ImportError: when pandas is missing
         """
-        unit = STANDARDISED if self.is_standardised else RAW
         parts = {"total": self.reward, "direct": self.reward_direct, "through the next state": self.reward_through_state}
         rows: list[tuple[Any, ...]] = []
         for i, action in enumerate(self.variables.action_names):
-            rows += [(action, "reward", part, *(values[i] for values in effect), unit) for part, effect in parts.items()]
+            rows += [(action, "reward", part, *(values[i] for values in effect), self.unit) for part, effect in parts.items()]
             for j, state in enumerate(self.variables.next_state_names):
-                rows.append((action, state, "total", *(values[j, i] for values in self.next_state), unit))
+                rows.append((action, state, "total", *(values[j, i] for values in self.next_state), self.unit))
         return frame_of(rows, ("action", "outcome", "part", *EffectStatistics._fields, "unit"))
 
     def plot(self, path: str | os.PathLike[str] | None = None, max_actions: int = 20, max_states: int = 30) -> "Figure":
@@ -195,7 +208,7 @@ class Trajectory(NamedTuple):
     """Shape ``(T,)``."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Counterfactual:
     """
     What would have been, in the environment's units, and the noise under which it would. It can be unpacked into the first
@@ -222,6 +235,9 @@ class Counterfactual:
     recorded: Trajectory
     noise_std: np.ndarray
     running_std: np.ndarray
+
+    def __repr__(self) -> str:
+        return counterfactual_in_words(self)
 
     def __iter__(self) -> Iterator[np.ndarray]:
         return iter((self.states, self.actions, self.rewards, self.state_noise, self.reward_noise))

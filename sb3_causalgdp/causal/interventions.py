@@ -18,6 +18,7 @@ from sb3_causalgdp.causal.rows import (
     EffectAverage,
     as_array,
     as_column,
+    as_numbers,
     as_vector,
     checked_positive,
     checked_rows,
@@ -408,7 +409,7 @@ class StructuralModel:
             raise ValueError(f"trajectory must be (states, actions, rewards), got {len(trajectory)} parts")
         states = np.atleast_2d(self._state_rows(trajectory[0], "states of the trajectory"))
         actions = np.atleast_2d(self._action_rows(trajectory[1], "actions of the trajectory"))
-        rewards = np.asarray(trajectory[2], dtype=np.float64)
+        rewards = as_numbers("rewards of the trajectory", trajectory[2])
         if len(states) != len(actions) + 1 or rewards.shape != (len(actions),):
             raise ValueError(
                 "trajectory must have T + 1 states, T actions and T rewards, "

@@ -39,9 +39,17 @@ def as_array(tensor: th.Tensor) -> np.ndarray:
     return tensor.detach().cpu().numpy().astype(np.float64)
 
 
+def as_numbers(name: str, values: npt.ArrayLike) -> np.ndarray:
+    """A copy in double precision, of what is no text that looks like numbers."""
+    array = np.asarray(values)
+    if array.dtype.kind not in "biuf":
+        raise ValueError(f"{name} must be numbers, got {' '.join(repr(values).split())[:100]}")
+    return array.astype(np.float64)
+
+
 def as_vector(name: str, values: npt.ArrayLike, size: int) -> np.ndarray:
     """A number for all, or one for each."""
-    array = np.asarray(values, dtype=np.float64)
+    array = as_numbers(name, values)
     if array.shape not in ((), (size,)):
         raise ValueError(f"{name} must be a number or have shape ({size},), got {array.shape}")
     return np.broadcast_to(array, (size,)).copy()
@@ -56,7 +64,7 @@ def checked_positive(name: str, values: np.ndarray) -> np.ndarray:
 
 def checked_rows(values: npt.ArrayLike, width: int, name: str) -> np.ndarray:
     """A finite copy of shape (width,) or (batch, width)."""
-    rows = np.array(values, dtype=np.float64)
+    rows = as_numbers(name, values)
     if rows.ndim not in (1, 2) or rows.shape[-1] != width or len(rows) == 0:
         raise ValueError(f"{name} must have shape ({width},) or (batch, {width}), got {rows.shape}")
     if not np.isfinite(rows).all():

@@ -1,7 +1,6 @@
 """From offline data to online learning, for any off-policy algorithm: preload, pretrain, and batches of both kinds."""
 
 import warnings
-from inspect import signature
 from typing import Any, TypeVar
 
 import numpy as np
@@ -25,9 +24,8 @@ from sb3_causalgdp.offline.preload import (
 from sb3_causalgdp.offline.pretraining import PretrainedAlgorithm, callback_list
 from sb3_causalgdp.offline.replay import SpacesEnv, can_sample
 from sb3_causalgdp.offline.rewards import check_reward_transform
-from sb3_causalgdp.offline.sources import open_source
+from sb3_causalgdp.offline.sources import open_source, with_columns
 from sb3_causalgdp.offline.spaces import spaces_of
-from sb3_causalgdp.sources.tables import Table
 
 SelfAlgorithm = TypeVar("SelfAlgorithm", bound="OfflineToOnlineAlgorithm")
 
@@ -94,12 +92,10 @@ class OfflineToOnlineAlgorithm(PretrainedAlgorithm):
         :param observation_space: Space of the observations; None for the source's
         :param action_space: Space of the actions; None for the source's
         :param kwargs: Arguments of the constructor; with a data frame or the path of a table also those of
-            :class:`~sb3_causalgdp.sources.tables.Table`, which :meth:`preload` takes then
+            :class:`~sb3_causalgdp.sources.tables.Table`, which :meth:`preload` takes, too
         :return: The model
         """
-        if "states" in kwargs and not isinstance(source, Table):
-            source = Table(source, **{name: kwargs.pop(name) for name in signature(Table).parameters if name in kwargs})
-        opened = open_source(source)
+        opened = open_source(with_columns(source, kwargs))
         observation_space, action_space = spaces_of(opened, observation_space, action_space)
         layout = observation_space
         names = opened.state_names or key_names(layout), opened.action_names
@@ -156,7 +152,8 @@ class OfflineToOnlineAlgorithm(PretrainedAlgorithm):
         tb_log_name: str = "run",
         progress_bar: bool = False,
     ) -> tuple[int, BaseCallback]:
-        assert self.env is not None, "You must set the environment before calling learn()"
+        if self.env is None:
+            raise ValueError("learn() needs an environment: give it to load(), or call set_env() first")
         self._load_offline_dataset(progress_bar)
         if self._n_pretrain_steps < self.pretrain_steps:
             steps = self.pretrain_steps - self._n_pretrain_steps

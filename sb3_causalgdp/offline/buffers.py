@@ -19,7 +19,7 @@ from sb3_causalgdp.offline.preload import (
     preload_buffer,
 )
 from sb3_causalgdp.offline.saved_buffers import can_be_arrays, read_buffer, write_buffer
-from sb3_causalgdp.offline.sources import open_source
+from sb3_causalgdp.offline.sources import open_source, with_columns
 from sb3_causalgdp.saving.archives import errors_of, existing
 from sb3_causalgdp.sources.buffers import SUFFIXES
 from sb3_causalgdp.sources.chunks import Source
@@ -59,6 +59,7 @@ class BufferedAlgorithm(LaidOutAlgorithm):
         progress_bar: bool = False,
         download: bool = True,
         trusted: bool = False,
+        **columns: Any,
     ) -> SelfAlgorithm:
         """
         Load recorded transitions into ``offline_buffer``: all of them, or none when something is wrong with them. Until
@@ -71,14 +72,19 @@ class BufferedAlgorithm(LaidOutAlgorithm):
         :param source: The id of a Minari dataset (``"D4RL/pointmaze/umaze-v2"``), a ``minari.MinariDataset``, a replay buffer
             of SB3 or the path of a saved one, or arrays: a mapping (or the path of an ``.npz`` file) of ``observations``,
             ``actions``, ``rewards``, ``next_observations``, ``terminations`` and ``truncations``; or a
-            :class:`~sb3_causalgdp.sources.tables.Table`
+            :class:`~sb3_causalgdp.sources.tables.Table`, or a data frame or the path of a table with ``columns``
         :param reward_transform: What is done to the rewards, here and in ``learn()``; None takes the constructor's
         :param progress_bar: Whether to show a progress bar (needs tqdm)
         :param download: Whether to download a dataset that is not on this machine
         :param trusted: Whether a pickled buffer may hold more than what SB3's own are made of, which could run code
+        :param columns: Of a table: ``states=``, ``actions=``, ``reward=`` and the other arguments of
+            :class:`~sb3_causalgdp.sources.tables.Table`
         :return: The model
         """
-        data = open_source(source, download, trusted)
+        table = with_columns(source, columns)
+        if columns:
+            raise TypeError(f"preload() got an unexpected keyword argument {next(iter(columns))!r}")
+        data = open_source(table, download, trusted)
         name = self.reward_transform if reward_transform is None else reward_transform
         if self._reward_transform is not None and name != self.reward_transform:
             raise ValueError(f"The model's rewards are transformed by {self.reward_transform!r} already, got {name!r}")

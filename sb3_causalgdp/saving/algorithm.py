@@ -16,6 +16,7 @@ from stable_baselines3.common.save_util import open_path, recursive_getattr
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 from stable_baselines3.common.vec_env import VecNormalize
 
+from sb3_causalgdp.arguments import CONSTRUCTOR_ARGUMENTS, check_arguments
 from sb3_causalgdp.checkpoints import TrainingCheckpointCallback, resume, save_checkpoint
 from sb3_causalgdp.checkpoints.callback_states import all_callbacks
 from sb3_causalgdp.checkpoints.checkpoint import bookkeeping_of
@@ -118,6 +119,8 @@ class SavedAlgorithm(DiscoveringAlgorithm):
         :raises ImportError: If a package for ONNX is missing
         :raises RuntimeError: If the file gives other actions than ``predict``
         """
+        if self._n_updates == 0:
+            warnings.warn("The model has not been trained: what is exported is the policy that it started with.")
         normalizer = self._vec_normalize_env if isinstance(vec_normalize, str) else vec_normalize
         export_policy(self.policy, path, self.transition_variables, guided, deterministic, normalizer)
 
@@ -183,6 +186,8 @@ class SavedAlgorithm(DiscoveringAlgorithm):
         """
         if custom_objects is not None and not isinstance(custom_objects, dict):
             raise ValueError(f"custom_objects must be a dict or None, got {type(custom_objects).__name__}")
+        # Wrong arguments are no fault of the file
+        check_arguments(CONSTRUCTOR_ARGUMENTS, kwargs)
         given = {**(custom_objects or {}), **{name: value for name, value in kwargs.items() if name != "policy_kwargs"}}
         # SB3's constructor takes an id, and its load does not
         env = None if env is None else maybe_make_env(env, verbose=0)

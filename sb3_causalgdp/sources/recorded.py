@@ -18,7 +18,10 @@ from sb3_causalgdp.sources.tables import Table
 
 OFFLINE_HINT = how_to_install("offline")
 MINARI_ID = re.compile(r"(\w+://[-\w]+/)?[-\w]+(/[-\w]+)*-v\d+")
-TABLE_HINT = "Table(source, states=[...], actions=[...], reward=...) of sb3_causalgdp.sources.tables"
+TABLE_HINT = (
+    "its columns must be known: give states=[...], actions=[...], reward=..., or "
+    "sb3_causalgdp.sources.tables.Table(source, states=[...], actions=[...], reward=...)"
+)
 
 __all__ = ["ArraySource", "BufferSource", "Chunk", "MinariSource", "Source", "TableSource", "open_source"]
 
@@ -93,12 +96,12 @@ def open_source(source: Any, download: bool = True, trusted: bool = False) -> So
     if isinstance(source, Table):
         return TableSource(source)
     if is_frame(source):
-        raise ValueError(f"Of a table the columns are needed: {TABLE_HINT}")
+        raise ValueError(f"{type(source).__name__} is a table, {TABLE_HINT}")
     if isinstance(source, Mapping):
         return ArraySource(source)
     if isinstance(source, str | os.PathLike):
         if Path(source).suffix.lower() in set(TABLE_SUFFIXES) - set(SUFFIXES):
-            raise ValueError(f"{source} is a table, whose columns are needed: {TABLE_HINT}")
+            raise ValueError(f"{source} is a table, {TABLE_HINT}")
         return _open_name(os.fspath(source), download, trusted)
     if hasattr(source, "iterate_episodes"):
         return MinariSource(source)

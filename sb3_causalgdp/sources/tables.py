@@ -11,6 +11,7 @@ from sb3_causalgdp.sources.columns import columns_of
 
 MOST_CATEGORIES = 50
 SHOWN = 5  # rows and names in messages
+MISTAKES = 0.1  # with a smaller share of words among its numbers, a column is no text
 GAP = 1.5  # times the median step between two rows: there, recording paused
 MISSING = ("raise", "drop")
 
@@ -115,8 +116,8 @@ class Table:
         listed = ", ".join(f"{name!r} {count}" for name, count in counts.items())
         if missing == "raise":
             raise ValueError(
-                f'{self.name} has missing or infinite values, by column: {listed}; missing="drop" leaves out {n_bad} of '
-                f"{n_all} transitions"
+                f"{self.name} has missing or infinite values, by column: {listed}; "
+                f'missing="drop" (on the command line --drop-missing) leaves out {n_bad} of {n_all} transitions'
             )
         self._remark(f"{n_bad} of {n_all} transitions left out for missing values, by column: {listed}")
 
@@ -183,6 +184,7 @@ def _as_numbers(table: str, name: str, values: np.ndarray) -> tuple[np.ndarray, 
     if all(isinstance(value, int | float) for value in texts[present]):
         numbers = np.array([np.nan if value is None else float(value) for value in texts])
         return numbers.reshape(-1, 1), [name], ""
+    _check_mostly_text(table, name, texts)
     labels = np.array([str(value) for value in texts])
     levels, counts = np.unique(labels[present], return_counts=True)
     if len(levels) > MOST_CATEGORIES:
@@ -194,6 +196,27 @@ def _as_numbers(table: str, name: str, values: np.ndarray) -> tuple[np.ndarray, 
     columns[~present] = np.nan
     remark = f"{name!r} is categorical: a column of 0 and 1 for {', '.join(map(repr, others))}, against {reference!r}"
     return columns, [f"{name}={level}" for level in others], remark
+
+
+def _check_mostly_text(table: str, name: str, values: np.ndarray) -> None:
+    """A few words among numbers are mistakes, no categories."""
+    wrong = [(row, value) for row, value in enumerate(values) if value is not None and not _is_number(value)]
+    n_present = sum(value is not None for value in values)
+    if 0 < len(wrong) < MISTAKES * n_present:
+        listed = ", ".join(f"{value!r} in row {row}" for row, value in wrong[:SHOWN])
+        more = f" and {len(wrong) - SHOWN} more" if len(wrong) > SHOWN else ""
+        raise ValueError(
+            f"column {name!r} of {table} has {listed}{more} among numbers (the first row is 0): "
+            "correct them, or leave them empty"
+        )
+
+
+def _is_number(value: Any) -> bool:
+    try:
+        float(value)
+    except ValueError:
+        return False
+    return True
 
 
 def _is_missing(value: Any) -> bool:

@@ -160,10 +160,14 @@ def own_title() -> Iterator[None]:
 
 class SuccessVecEnv(VecEnvWrapper):
     """
-    Environments that say ``is_success``, as SB3 does, where they say ``success``.
+    Environments that say ``is_success``, as SB3 does, where they say ``success``, and count the episodes that ended.
 
     :param venv: The environments
     """
+
+    def __init__(self, venv: VecEnv) -> None:
+        super().__init__(venv)
+        self.n_ended = 0
 
     def reset(self) -> VecEnvObs:
         return self.venv.reset()
@@ -172,21 +176,25 @@ class SuccessVecEnv(VecEnvWrapper):
         observations, rewards, dones, infos = self.venv.step_wait()
         for info in infos:
             note_success(info)
+        self.n_ended += int(dones.sum())
         return observations, rewards, dones, infos
 
 
 @contextmanager
 def told_success() -> Iterator[None]:
-    """``enjoy`` prints the success rate of more environments."""
+    """``enjoy`` prints the success rate of more environments, and does not end without a word."""
     import rl_zoo3
 
-    create = rl_zoo3.create_test_env
+    create, made = rl_zoo3.create_test_env, []
 
     def create_ours(*args: Any, **kwargs: Any) -> VecEnv:
-        return SuccessVecEnv(create(*args, **kwargs))
+        made.append(SuccessVecEnv(create(*args, **kwargs)))
+        return made[-1]
 
     with replaced(rl_zoo3, "create_test_env", create_ours):
         yield
+    if made and not any(environment.n_ended for environment in made):
+        print("No episode has ended, so there is no return: play more steps, by -n")
 
 
 SURROUNDINGS: dict[str, list[Callable[[], Any]]] = {

@@ -250,9 +250,17 @@ def test_what_is_missing_in_a_table_is_said(tmp_path, capsys):
     write_table(tmp_path / "tank.csv")
     text = (tmp_path / "tank.csv").read_text().splitlines()
     (tmp_path / "tank.csv").write_text("\n".join([*text[:5], "0,4,,0.5,1", *text[6:]]))
-    assert "missing or infinite values, by column: 'level' 1" in error_of(capsys, tmp_path / "tank.csv", *TABLE)
+    error = error_of(capsys, tmp_path / "tank.csv", *TABLE)
+    assert "missing or infinite values, by column: 'level' 1" in error and "--drop-missing) leaves out 2 of 299" in error
     main([str(tmp_path / "tank.csv"), *TABLE, "--drop-missing"])
     assert "remark: 2 of 299 transitions left out for missing values, by column: 'level' 1" in capsys.readouterr().out
+
+
+def test_names_without_commas_are_explained(tmp_path, capsys):
+    write_table(tmp_path / "tank.csv")
+    error = error_of(capsys, tmp_path / "tank.csv", "--state", "level", "second", "--action", "valve", "--reward", "cost")
+    assert "unrecognized arguments: second; several names are separated by commas, like --state level,temperature" in error
+    assert "commas" not in error_of(capsys, tmp_path / "tank.csv", *TABLE, "--no-such-option")
 
 
 def test_the_picture_takes_the_options_of_a_view(arrays, tmp_path, capsys):

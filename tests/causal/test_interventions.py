@@ -161,6 +161,7 @@ BAD_INTERVENTIONS = [
     ({"x'": np.inf}, "x' must be set to finite values, got inf"),
     ({"u": 2.5}, r"u must be in \[-2, 2\], got 2.5 \(in interventions, row 0\)"),
     ({"v": -0.1}, r"v must be in \[0, 10\], got -0.1"),
+    ({"x": "1"}, "x must be numbers, got '1'"),
     ({"x": [1.0, 2.0]}, r"x must be a number or have shape \(1,\), got \(2,\)"),
 ]
 
@@ -543,6 +544,34 @@ def test_an_intervention_is_told_by_name_beside_what_would_be_without(in_other_u
     np.testing.assert_allclose(frame["standardised_change"] * outcome.running_std, frame["change"])
     assert abs(frame["standardised_change"]["y'"] - frame["change"]["y'"]) > 1.0
     assert plain.without is None and (plain.to_dataframe()["change"] == 0.0).all()
+
+
+def test_answers_print_as_a_table_by_name(in_other_units, linear):
+    state, action = np.array([1.0, -100.0, 0.0]), np.array([0.0, 5.0])
+    outcome = in_other_units.intervene(state, action, {"u": 2.0})
+    lines = str(outcome).splitlines()
+    assert lines[0] == "Outcomes of an intervention, 1 observation, in the environment's units"
+    assert [line.split()[0] for line in lines[1:]] == ["outcome", "reward", "x'", "y'", "z'"]
+    assert lines[3].split()[-1] == "+1" and lines[4].split()[-1] == "-3"
+    effects = in_other_units.effect_of_actions(state, action)
+    printed = {line.split()[0]: line.split()[1:4] for line in str(effects).splitlines()[2:]}
+    for i, name in enumerate(("u", "v")):
+        parts = (effects.reward, effects.reward_direct, effects.reward_through_state)
+        assert printed[name] == [f"{part.mean[i]:+.3g}" for part in parts]
+    assert effects.standardised().unit in str(effects.standardised()) and effects.unit in str(effects)
+    recorded = linear_trajectory()
+    answer = linear.counterfactual(recorded, {"u": -0.4})
+    first, _, *rows = str(answer).splitlines()
+    assert f"return {answer.rewards.sum():.4g}, recorded {np.sum(recorded[2]):.4g}" in first
+    assert len(rows) == 5 and f"u         {np.abs(-0.4 - recorded[1][:, 0]).mean():.3g}" in str(answer)
+
+
+def test_a_printed_answer_fits_on_a_screen():
+    names = tuple(f"s{i}" for i in range(60))
+    model = MaskedWorldModel(60, 1, [4]).double()
+    structural = StructuralModel(model, TransitionVariables(names, ("a",)))
+    outcome = structural.intervene(np.zeros(60), [0.0], {"a": 1.0})
+    assert len(str(outcome).splitlines()) <= 25 and "and 41 more, which change less" in str(outcome)
 
 
 def test_a_batch_has_rows_for_each_observation(linear):

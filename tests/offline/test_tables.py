@@ -81,5 +81,17 @@ def test_arrays_tell_their_shapes():
 def test_a_frame_without_roles_says_what_is_needed(tmp_path):
     make_frame().to_csv(tmp_path / "tank.csv")
     for source in (make_frame(), str(tmp_path / "tank.csv")):
-        with pytest.raises(ValueError, match=r"columns are needed: Table\(source, states="):
+        with pytest.raises(ValueError, match=r"its columns must be known: give states="):
             make(source)
+
+
+def test_a_frame_is_preloaded_by_the_names_of_its_columns():
+    frame, columns = make_frame(), {"states": ["level"], "actions": ["valve"], "reward": "cost", "episode": "run"}
+    expected, found = (make(Table(frame, **columns)) for _ in range(2))
+    expected.preload(Table(frame, **columns))
+    found.preload(frame, **columns)
+    np.testing.assert_array_equal(found.offline_buffer.observations, expected.offline_buffer.observations)
+    with pytest.raises(ValueError, match="a table needs actions=, too: got states, reward"):
+        found.preload(frame, states=["level"], reward="cost")
+    with pytest.raises(TypeError, match="unexpected keyword argument 'rewards'"):
+        found.preload(frame, rewards="cost")

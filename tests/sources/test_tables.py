@@ -93,7 +93,7 @@ def test_missing_values_are_counted_by_column():
     frame = make_frame(1, 20)
     frame.loc[[3, 4], "level"] = np.nan
     frame.loc[9, "cost"] = np.inf
-    with pytest.raises(ValueError, match=r"by column: 'level' 2, 'cost' 1; missing=\"drop\" leaves out 4 of 19 transitions"):
+    with pytest.raises(ValueError, match=r"by column: 'level' 2, 'cost' 1; missing=\"drop\" .*leaves out 4 of 19 transitions"):
         Table(frame, **ROLES)
     table = Table(frame, **ROLES, missing="drop")
     assert len(table) == 15 and np.isfinite(table.next_observations).all()
@@ -185,3 +185,25 @@ def test_files_that_cannot_be_read_say_so(tmp_path, monkeypatch):
 def test_discover_says_which_columns_it_needs():
     with pytest.raises(ValueError, match=r"of a table the columns are needed.*missing are \['actions', 'reward'\]"):
         discover(make_frame(), states=["level"])
+
+
+def test_a_word_among_numbers_is_named_with_its_row():
+    frame = make_frame().astype({"level": object})
+    frame.loc[7, "level"], frame.loc[9, "level"] = "err", "12,5"
+    with pytest.raises(ValueError, match=r"column 'level' of the table has 'err' in row 7, '12,5' in row 9 among numbers"):
+        Table(frame, **ROLES)
+
+
+def test_levels_of_which_some_are_numbers_are_categories():
+    frame = make_frame()
+    frame["grade"] = np.tile(["1", "2", "A"], len(frame))[: len(frame)]
+    table = Table(frame, **{**ROLES, "states": ["level", "grade"]})
+    assert table.state_names == ("level", "grade=2", "grade=A")
+
+
+@pytest.mark.parametrize(("suffix", "separator"), [(".csv", ";"), (".csv", "\t"), (".tsv", ",")])
+def test_another_separator_is_named(tmp_path, suffix, separator):
+    path = tmp_path / f"tank{suffix}"
+    make_frame().to_csv(path, index=False, sep=separator)
+    with pytest.raises(ValueError, match=f"its values are separated by {separator!r}".replace("\\", "\\\\")):
+        Table(path, **ROLES)

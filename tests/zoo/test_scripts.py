@@ -99,6 +99,13 @@ def test_playing_takes_no_memory_for_transitions(zoo, logs, capsys, monkeypatch)
     assert loaded[0].policy.is_guided
 
 
+def test_playing_without_an_end_says_that_there_is_no_return(zoo, logs, capsys):
+    zoo("enjoy", *PENDULUM, "-f", "logs", "--exp-id", 1, "--load-best", "--no-render", "-n", 5)
+    assert "No episode has ended" in capsys.readouterr().out
+    zoo("enjoy", *PENDULUM, "-f", "logs", "--exp-id", 1, "--load-best", "--no-render", "-n", 50)
+    assert "No episode has ended" not in capsys.readouterr().out
+
+
 @needs("moviepy", "pygame")
 def test_a_video_is_recorded(zoo, logs):
     zoo("record_video", *PENDULUM, "-f", "logs", "-n", 3)

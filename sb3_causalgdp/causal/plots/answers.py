@@ -37,9 +37,9 @@ def plot_intervention(
         raise ValueError(f"max_outcomes must be at least 1, got {max_outcomes!r}")
     names = (*outcome.variables.next_state_names, "reward")
     scale = outcome.running_std
-    means, stds = (np.atleast_2d(values).mean(axis=0) / scale for values in outcome._columns())
+    means, stds = (np.atleast_2d(values).mean(axis=0) / scale for values in outcome.columns())
     without = outcome if outcome.without is None else outcome.without
-    base, base_stds = (np.atleast_2d(values).mean(axis=0) / scale for values in without._columns())
+    base, base_stds = (np.atleast_2d(values).mean(axis=0) / scale for values in without.columns())
     order = np.argsort(-np.abs(means - base)[:-1], kind="stable")[: max_outcomes - 1]
     shown = np.append(np.sort(order), len(names) - 1)
     height = 1.6 + ROW_INCHES * max(len(shown), 3)
