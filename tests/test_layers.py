@@ -35,7 +35,7 @@ LAYERS = [
     {"causal.rows"},
     {"causal.answers", "causal.description", "causal.relevance"},
     {"causal.drawing", "causal.variables"},
-    {"causal.edges", "sources", "lazy"},
+    {"causal.answers_in_words", "causal.edges", "sources", "lazy"},
     {
         "checks",
         "divergence",

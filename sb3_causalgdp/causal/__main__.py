@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
 
@@ -26,11 +26,19 @@ SHOWN_VALUES = 8
 SHOWN_GROUPS = 20
 
 
+class _Parser(argparse.ArgumentParser):
+    def error(self, message: str) -> NoReturn:
+        """A second name behind an option is taken for an argument too many."""
+        if message.startswith("unrecognized arguments:") and not message.split()[2].startswith("-"):
+            message += "; several names are separated by commas, like --state level,temperature"
+        super().error(message)
+
+
 def make_parser() -> argparse.ArgumentParser:
     """
     :return: the command line's parser
     """
-    parser = argparse.ArgumentParser(
+    parser = _Parser(
         prog="python -m sb3_causalgdp.causal",
         usage="%(prog)s SOURCE [options]",
         description="Find the causal graph of recorded transitions with continuous actions, and print what it says.",
@@ -128,10 +136,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     :param argv: Its arguments, by default those of the process
     """
     parser = make_parser()
-    arguments, unknown = parser.parse_known_args(argv)
-    if unknown:
-        hint = "" if unknown[0].startswith("-") else "; several names are separated by commas, like --state level,temperature"
-        parser.error(f"unrecognized arguments: {' '.join(unknown)}{hint}")
+    arguments = parser.parse_args(argv)
     try:
         run(arguments)
     except (ValueError, OSError, ImportError) as error:
