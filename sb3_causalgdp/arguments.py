@@ -278,6 +278,7 @@ POLICY_ARGUMENTS: dict[str, Kind] = {
     "one_pass": FLAG,
     "value_network": FLAG,
     "causal_abstraction": FLAG | choice(["auto"]),
+    "use_ema": FLAG,
 }
 """Every argument of :class:`~sb3_causalgdp.policies.CausalGDPPolicy`, what goes into ``policy_kwargs`` among them."""
 

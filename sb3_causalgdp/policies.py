@@ -90,6 +90,9 @@ class CausalGDPPolicy(AbstractingPolicy):
     :param value_network: Whether the critics include a network V(s)
     :param causal_abstraction: Whether components of observations and actions can be hidden from actor and critics, see
         :meth:`~sb3_causalgdp.abstraction.AbstractingPolicy.show`; ``auto``: where that works
+    :param use_ema: Whether deterministic predictions are those of the actor's exponential moving average, which is steadier
+        from one update to the next, and from which diffusion models are sampled (Ho et al., 2020,
+        https://arxiv.org/abs/2006.11239); exploring ones are always the actor's own
     """
 
     candidate_noise: th.Tensor
@@ -135,6 +138,7 @@ class CausalGDPPolicy(AbstractingPolicy):
         one_pass: bool = False,
         value_network: bool = False,
         causal_abstraction: bool | str = False,
+        use_ema: bool = True,
     ) -> None:
         check_arguments(POLICY_ARGUMENTS, locals())
         check_keywords("features_extractor_kwargs", features_extractor_kwargs or {}, features_extractor_class)
@@ -184,6 +188,7 @@ class CausalGDPPolicy(AbstractingPolicy):
         self.normalize_observations = normalize_observations
         self.share_features_extractor = share_features_extractor
         self.causal_abstraction = bool(causal_abstraction)
+        self.use_ema = use_ema
         self.world_model_net_arch = world_model_net_arch
         actor_arch, critic_arch = get_actor_critic_arch(self.net_arch)
         shared_kwargs = {
@@ -307,6 +312,7 @@ class CausalGDPPolicy(AbstractingPolicy):
             world_model_net_arch=self.world_model_net_arch,
             value_network=self.value_network,
             causal_abstraction=self.causal_abstraction,
+            use_ema=self.use_ema,
             lr_schedule=self._dummy_schedule,  # not needed for loading the policy alone
             **self.diffusion_kwargs,
             **self.guidance_kwargs,
@@ -361,6 +367,14 @@ class CausalGDPPolicy(AbstractingPolicy):
 
     def forward(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         return self._predict(observation, deterministic=deterministic)
+
+    def acting_actor(self, deterministic: bool) -> DiffusionActor:
+        """
+        :param deterministic: Whether it plays, and does not explore
+        :return: The network that acts: the exponential moving average of the actor where it plays, which is steadier from one
+            update to the next; the actor itself where it explores, and without ``use_ema``
+        """
+        return self.actor_target if deterministic and self.use_ema else self.actor
 
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         action = act(self, observation, deterministic)

@@ -10,7 +10,7 @@ from stable_baselines3.common.type_aliases import PyTorchObs
 
 from sb3_causalgdp.acceleration.acting import NumpyActing, OnePassActing
 from sb3_causalgdp.checks import first_not_finite_index, fits_float32
-from sb3_causalgdp.networks import smallest_q
+from sb3_causalgdp.networks import DiffusionActor, smallest_q
 
 Policy = Any  # a CausalGDPPolicy, whose file imports this one
 
@@ -31,20 +31,21 @@ def act(policy: Policy, observation: PyTorchObs, deterministic: bool) -> th.Tens
             "The policy cannot be traced or exported by PyTorch, which would take its actions for constants: "
             "use model.export('policy.onnx') or policy.export, also for .pt (TorchScript) and .pt2 (torch.export)"
         )
-    acting = _numpy_acting(policy, observation)
+    acting, plays = _numpy_acting(policy, observation), deterministic and policy.use_ema
     if isinstance(acting, OnePassActing):
         assert isinstance(observation, th.Tensor)
-        return th.from_numpy(acting(observation.float().flatten(1).numpy()))
+        return th.from_numpy(acting(observation.float().flatten(1).numpy(), plays))
     if acting is not None:
         assert isinstance(observation, th.Tensor)
         noise = candidate_noise(policy, len(observation), deterministic).cpu().numpy()
-        actions = acting(policy, observation.float().flatten(1).cpu().numpy(), noise, policy.is_guided)
+        actions = acting(policy, observation.float().flatten(1).cpu().numpy(), noise, policy.is_guided, plays)
         return th.as_tensor(actions, device=observation.device)
     with th.no_grad():
-        features = policy.actor.features(observation)
-        if policy.actor.one_pass is not None:
-            return policy.actor.sample(features)
-        return act_in_torch(policy, observation, features, candidate_noise(policy, len(features), deterministic))
+        actor = policy.acting_actor(deterministic)
+        features = actor.features(observation)
+        if actor.one_pass is not None:
+            return actor.sample(features)
+        return act_in_torch(policy, actor, observation, features, candidate_noise(policy, len(features), deterministic))
 
 
 def is_traced() -> bool:
@@ -69,10 +70,16 @@ def _numpy_acting(policy: Policy, observation: PyTorchObs) -> NumpyActing | OneP
 
 
 def act_in_torch(
-    policy: Policy, observation: PyTorchObs, features: th.Tensor, noise: th.Tensor, guided: bool | None = None
+    policy: Policy,
+    actor: DiffusionActor,
+    observation: PyTorchObs,
+    features: th.Tensor,
+    noise: th.Tensor,
+    guided: bool | None = None,
 ) -> th.Tensor:
     """
     :param policy: The policy
+    :param actor: That of its actors that acts
     :param observation: Observations as SB3 gives them to policies
     :param features: The actor's features of these
     :param noise: Of the candidates, see :func:`candidate_noise`
@@ -80,14 +87,14 @@ def act_in_torch(
     :return: Actions in [-1, 1], shape ``(batch, d)``
     """
     critic_features = policy.critic_target.extract_features(observation, policy.critic_target.features_extractor)
-    candidates = policy.actor.sample(features.repeat_interleave(policy.n_action_candidates, dim=0), noise)
+    candidates = actor.sample(features.repeat_interleave(policy.n_action_candidates, dim=0), noise)
     best = _best_candidate(policy, critic_features, candidates)
     action = candidates[best]
     if not (policy.is_guided if guided is None else guided):
         return action
     # From the same noise, the guided chain ends at the best candidate, moved by the guidance
-    guidance = policy.acting_guidance(policy.causal_state(observation), action)
-    return policy.actor.sample(features, noise[:, best], guidance, policy.guidance_rule)
+    guidance = policy.acting_guidance(policy.causal_state(observation), action, actor)
+    return actor.sample(features, noise[:, best], guidance, policy.guidance_rule)
 
 
 def fixed_noise(n_steps: int, n_candidates: int, action_dim: int) -> th.Tensor:

@@ -64,6 +64,7 @@ _OF_DIFFUSION_QL: dict[str, Any] = {
         "critic_normalization": None,
         "normalize_observations": False,
         "prediction_type": "noise",
+        "use_ema": False,
     },
 }
 OFFLINE: dict[str, dict[str, Any]] = {

@@ -166,22 +166,24 @@ class SteeredPolicy(SavedPolicy):
             self.world_model, state, next_state, outcome, self.state_guidance_scale, self.outcome_guidance_scale
         )
 
-    def acting_guidance(self, state: th.Tensor, action: th.Tensor) -> LinearisedGuidance:
+    def acting_guidance(self, state: th.Tensor, action: th.Tensor, actor: DiffusionActor | None = None) -> LinearisedGuidance:
         """
         Guidance where the next state is not known: s* is the model's own prediction for an action, about which the guidance is
         linear, so that the world model is evaluated once and not at every diffusion step.
 
         :param state: s, shape ``(batch, n)``
         :param action: The best candidate, shape ``(batch, d)``
+        :param actor: That of the actors that acts, None for the one that learns
         :return: The guidance for these states
         """
+        actor = self.actor if actor is None else actor
         response = self.world_model.action_response(state, action, of_all=False)
         next_state = response.next_state
         next_action = action
         if self.guidance_target != "reward" and not self.has_image_state:
-            features = self._features_of_state(next_state, self.actor.features_extractor)
+            features = self._features_of_state(next_state, actor.features_extractor)
             # The next state is near: one step of the denoiser stands for a chain
-            next_action = self.actor.adapt(features, action)
+            next_action = actor.adapt(features, action)
         return LinearisedGuidance(self.make_guidance(state, next_state, next_action), action, response)
 
 

@@ -129,6 +129,31 @@ def test_exploration_noise_is_added_to_the_diffusion_policys_own(observations):
     assert spread[1.0] > spread[0.0] + 0.3
 
 
+def with_other_actor(model, source, target):
+    """A copy whose actor of one name has the weights of another name's."""
+    changed = deepcopy(model.policy)
+    getattr(changed, target).load_state_dict(getattr(model.policy, source).state_dict())
+    return changed
+
+
+@pytest.mark.parametrize("kwargs", [{}, {"actor_update": "trust_region"}], ids=["denoiser", "one pass"])
+def test_the_actor_s_moving_average_plays_and_the_actor_explores(kwargs, observations):
+    model = train(learning_rate=1e-2, eta=0.01, **kwargs)
+    of_average = with_other_actor(model, "actor_target", "actor")
+    of_actor = with_other_actor(model, "actor", "actor_target")
+
+    def predict(policy, deterministic):
+        th.manual_seed(0)
+        return policy.predict(observations, deterministic=deterministic)[0]
+
+    np.testing.assert_array_equal(predict(model.policy, True), predict(of_average, True))
+    assert np.abs(predict(model.policy, True) - predict(of_actor, True)).max() > 1e-3
+    np.testing.assert_array_equal(predict(model.policy, False), predict(of_actor, False))
+    assert np.abs(predict(model.policy, False) - predict(of_average, False)).max() > 1e-3
+    model.policy.use_ema = False
+    np.testing.assert_array_equal(predict(model.policy, True), predict(of_actor, True))
+
+
 def test_the_actor_alone_predicts_without_noise_when_asked_to(trained, observations):
     first, _ = trained.actor.predict(observations, deterministic=True)
     np.testing.assert_array_equal(trained.actor.predict(observations, deterministic=True)[0], first)

@@ -157,15 +157,15 @@ def test_the_one_pass_policy_asks_the_denoiser_nothing_and_survives_saving(tmp_p
     actions, _ = model.predict(observations, deterministic=True)
     assert isinstance(model.policy._acting, OnePassActing)
     with th.no_grad():
-        features = model.actor.features(th.as_tensor(observations))
-        plain = 2.0 * model.actor.one_pass(features).numpy()  # Pendulum's torques reach to 2
+        features = model.actor_target.features(th.as_tensor(observations))
+        plain = 2.0 * model.actor_target.one_pass(features).numpy()  # Pendulum's torques reach to 2
     np.testing.assert_allclose(actions, plain, rtol=1e-4, atol=1e-5)
     model.save(tmp_path / "model")
     loaded = CausalGDP.load(tmp_path / "model", env="Pendulum-v1")
     np.testing.assert_array_equal(loaded.predict(observations, deterministic=True)[0], actions)
     assert th.equal(vector(loaded.critic), vector(model.critic))
     with th.no_grad():
-        for parameter in model.actor.denoiser.parameters():
+        for parameter in (*model.actor.denoiser.parameters(), *model.actor_target.denoiser.parameters()):
             parameter.fill_(th.nan)
     np.testing.assert_array_equal(model.predict(observations, deterministic=True)[0], actions)
 

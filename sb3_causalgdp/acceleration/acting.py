@@ -35,7 +35,7 @@ Policy = Any  # a CausalGDPPolicy, whose file imports this one
 
 
 def _networks_of(policy: Policy) -> tuple[nn.Module, ...]:
-    return policy.actor.denoiser, policy.critic_target, policy.world_model
+    return policy.actor.denoiser, policy.actor_target.denoiser, policy.critic_target, policy.world_model
 
 
 class HostCopy:
@@ -105,7 +105,7 @@ class NumpyActing(_Views):
     def __init__(self, policy: Policy, copies: bool | None = None) -> None:
         self._copy = HostCopy(policy) if copies or (copies is None and policy.device.type != "cpu") else None
         near = policy if self._copy is None else self._copy.policy
-        self.denoiser = Denoiser(near)
+        self.denoisers = {False: Denoiser(near.actor), True: Denoiser(near.actor_target)}
         self.features = Features(near)
         self.critics = Critics(near)
         self.world_model = WorldModel(near.world_model)
@@ -151,32 +151,33 @@ class NumpyActing(_Views):
             and (rule is None or not rule.needs_jacobian)
         )
 
-    def __call__(self, policy: Policy, state: np.ndarray, noise: np.ndarray, guided: bool) -> np.ndarray:
+    def __call__(self, policy: Policy, state: np.ndarray, noise: np.ndarray, guided: bool, by_average: bool) -> np.ndarray:
         """
         :param policy: The policy, for its settings
         :param state: The observations, float32, shape ``(batch, n)``
         :param noise: Noise of the candidates, shape ``(K, batch * n_action_candidates, d)``
         :param guided: Whether the guidance is on
+        :param by_average: Whether the actor's moving average acts
         :return: Actions in [-1, 1], shape ``(batch, d)``
         """
         if self._copy is not None:
             self._copy.refresh()
         # On products this small, several threads of numpy's library mostly wait for each other: ten times the time
         if all(library.num_threads == 1 for library in self._blas.lib_controllers):
-            return self._act(policy, state, noise, guided)
+            return self._act(policy, state, noise, guided, self.denoisers[by_average])
         with self._blas.limit(limits=1):
-            return self._act(policy, state, noise, guided)
+            return self._act(policy, state, noise, guided, self.denoisers[by_average])
 
-    def _act(self, policy: Policy, state: np.ndarray, noise: np.ndarray, guided: bool) -> np.ndarray:
+    def _act(self, policy: Policy, state: np.ndarray, noise: np.ndarray, guided: bool, denoiser: Denoiser) -> np.ndarray:
         n_candidates = policy.n_action_candidates
         features = self.features(state.T)
-        time_part = self.denoiser.time_part()
-        bound = self.denoiser.bind(features, self.denoiser.at_points(time_part))
+        time_part = denoiser.time_part()
+        bound = denoiser.bind(features, denoiser.at_points(time_part))
         noise = (noise if self.action_gate is None else noise * self.action_gate).transpose(0, 2, 1)
         repeated = bound if n_candidates == 1 else np.repeat(bound, n_candidates, axis=2)
-        start, scaled_noise = noise[0], self.denoiser.scaled(noise)
-        first_prediction = self.denoiser.predict(start, repeated[-1])
-        action = self.denoiser.sample(repeated, start, scaled_noise, first_prediction).T
+        start, scaled_noise = noise[0], denoiser.scaled(noise)
+        first_prediction = denoiser.predict(start, repeated[-1])
+        action = denoiser.sample(repeated, start, scaled_noise, first_prediction).T
         if n_candidates > 1:
             values = self.critics.values(features, action.T, n_candidates).reshape(-1, n_candidates)
             best = np.arange(0, len(action), n_candidates) + values.argmax(axis=1)
@@ -184,12 +185,12 @@ class NumpyActing(_Views):
             scaled_noise = scaled_noise[:, :, best]
         if guided:
             assert self.rule is not None
-            shift = self.rule.shift(action, *self._local_model(policy, state, action, time_part))
-            action = self.denoiser.sample(bound, start, scaled_noise, first_prediction, shift).T
+            shift = self.rule.shift(action, *self._local_model(policy, state, action, denoiser, time_part))
+            action = denoiser.sample(bound, start, scaled_noise, first_prediction, shift).T
         return np.ascontiguousarray(action if self.action_gate is None else action * self.action_gate)
 
     def _local_model(
-        self, policy: Policy, state: np.ndarray, action: np.ndarray, time_part: np.ndarray
+        self, policy: Policy, state: np.ndarray, action: np.ndarray, denoiser: Denoiser, time_part: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """Gradient and curvature of the guidance at the best candidate, whose predicted state is the one to reach."""
         modelled = policy.world_model.modelled_indices
@@ -198,7 +199,7 @@ class NumpyActing(_Views):
         by_next_state, by_action = response["reward_by_next_state"], response["reward_by_action"]
         if policy.guidance_target == "return":
             error, std = ONE, self.return_std
-            by_value = self._value_gradient(response, action, time_part)[:, of]
+            by_value = self._value_gradient(response, action, denoiser, time_part)[:, of]
             by_next_state = by_next_state + np.float32(policy.discount) * by_value
         else:
             reward, std = self.world_model.reward_distribution(response["standardised_reward"])
@@ -212,9 +213,11 @@ class NumpyActing(_Views):
             curvature = curvature + np.float32(policy.state_guidance_scale) * (to_state.transpose(0, 2, 1) @ to_state)
         return gradient, curvature
 
-    def _value_gradient(self, response: dict[str, np.ndarray], action: np.ndarray, time_part: np.ndarray) -> np.ndarray:
+    def _value_gradient(
+        self, response: dict[str, np.ndarray], action: np.ndarray, denoiser: Denoiser, time_part: np.ndarray
+    ) -> np.ndarray:
         features = self.features(response["next_state"].T)
-        gradient = self.critics.gradient(features, self.denoiser.adapt(features, action.T, time_part))
+        gradient = self.critics.gradient(features, denoiser.adapt(features, action.T, time_part))
         return self.features.backward(gradient, features).T
 
 
@@ -227,17 +230,18 @@ class OnePassActing(_Views):
 
     def __init__(self, policy: Policy) -> None:
         self.features = Features(policy)
-        self.layers = [(view(layer.weight), view(layer.bias)[:, None]) for layer in _linear(policy)]
+        networks = policy.actor.one_pass, policy.actor_target.one_pass
+        self.layers = [[(view(layer.weight), view(layer.bias)[:, None]) for layer in _linear(network)] for network in networks]
         self.activation = ACTIVATIONS[policy.activation_fn].value
-        network = policy.actor.one_pass
-        self._remember((network,), [*network.parameters(), *policy.critic_target.features_extractor.buffers()])
+        parameters = [parameter for network in networks for parameter in network.parameters()]
+        self._remember(networks, [*parameters, *policy.critic_target.features_extractor.buffers()])
 
     def is_current(self, policy: Policy) -> bool:
         """
         :param policy: The policy
         :return: Whether the views are still those of its networks, which may have been moved or replaced
         """
-        return self._has_the_same((policy.actor.one_pass,))
+        return self._has_the_same((policy.actor.one_pass, policy.actor_target.one_pass))
 
     @staticmethod
     def covers(policy: Policy) -> bool:
@@ -259,12 +263,13 @@ class OnePassActing(_Views):
             and all(parameter.dtype == th.float32 for parameter in policy.actor.one_pass.parameters())
         )
 
-    def __call__(self, state: np.ndarray) -> np.ndarray:
+    def __call__(self, state: np.ndarray, by_average: bool) -> np.ndarray:
         """
         :param state: The observations, float32, shape ``(batch, n)``
+        :param by_average: Whether the network's moving average acts
         :return: Actions in [-1, 1], shape ``(batch, d)``
         """
-        (weight, bias), *layers = self.layers
+        (weight, bias), *layers = self.layers[by_average]
         hidden = weight @ self.features(state.T)
         hidden += bias
         for weight, bias in layers:
@@ -273,8 +278,8 @@ class OnePassActing(_Views):
         return np.ascontiguousarray(np.tanh(hidden).T)
 
 
-def _linear(policy: Policy) -> list[nn.Linear]:
-    return [module for module in policy.actor.one_pass if isinstance(module, nn.Linear)]
+def _linear(network: nn.Sequential) -> list[nn.Linear]:
+    return [module for module in network if isinstance(module, nn.Linear)]
 
 
 def _shows_vectors(extractor: nn.Module) -> bool:

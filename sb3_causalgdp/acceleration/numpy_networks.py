@@ -80,8 +80,8 @@ class Denoiser:
     transposed weights. ``dot`` starts a microsecond earlier than ``@``.
     """
 
-    def __init__(self, policy: Policy) -> None:
-        actor, denoiser = policy.actor, policy.actor.denoiser
+    def __init__(self, actor: Any) -> None:
+        denoiser = actor.denoiser
         weight, self.bias = layer_of(denoiser.input_layer)
         first_time = denoiser.action_dim
         first_condition = first_time + denoiser.time_table.shape[1]

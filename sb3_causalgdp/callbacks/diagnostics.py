@@ -80,7 +80,7 @@ def choice(policy: CausalGDPPolicy, observations: PyTorchObs) -> Choice:
     values = smallest_q(critic, repeated, candidates).view(-1, n_candidates)
     unguided = values.amax(dim=1).mean()
     spread = candidates.view(n_observations, n_candidates, -1).std(dim=1, correction=0).mean()
-    actions = act_in_torch(policy, observations, features, noise)
+    actions = act_in_torch(policy, policy.actor, observations, features, noise)
     value = smallest_q(critic, critic_features, actions).mean()
     advantage = float(value - unguided) if policy.is_guided else 0.0
     return Choice(float(value), advantage, float(spread))

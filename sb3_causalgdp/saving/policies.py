@@ -24,6 +24,7 @@ _FIRST_DEFAULTS: dict[str, Any] = {
     "critic_normalization": None,
     "normalize_observations": False,
     "prediction_type": "noise",
+    "use_ema": False,
 }
 
 

@@ -55,8 +55,8 @@ def both_paths(policy, observations, deterministic=False):
         th.manual_seed(3)
         fast = act(policy, observations, deterministic)
         th.manual_seed(3)
-        noise = candidate_noise(policy, len(observations), deterministic)
-        return fast, act_in_torch(policy, observations, policy.actor.features(observations), noise)
+        noise, actor = candidate_noise(policy, len(observations), deterministic), policy.acting_actor(deterministic)
+        return fast, act_in_torch(policy, actor, observations, actor.features(observations), noise)
 
 
 @pytest.mark.parametrize(("state_unit", "reward_unit"), [(1.0, 1e-9), (1e-6, 1.0), (0.0, 1.0), (1.0, 0.0)])
