@@ -232,7 +232,6 @@ SAMPLERS: dict[str, Callable[[Sequence[Point], float], list[Stage]]] = {
     "heun": _heun,
     "dpm_solver": _dpm_solver,
 }
-STOCHASTIC_SAMPLERS = ("ddpm", "euler_maruyama")
 # Share of the action's size at the noise end up to which it does not matter that a start of pure noise has none of it
 LEAST_SIGNAL = 0.01
 SPACINGS = ("time", "log_snr")
@@ -266,7 +265,7 @@ def sampling_plan(
     if key not in schedule.plans:
         points = sampling_points(schedule, n_steps, spacing)
         stages = SAMPLERS[sampler](points, eta)
-        draws_noise = sampler in STOCHASTIC_SAMPLERS or any(stage.std > 0.0 for stage in stages)
+        draws_noise = any(stage.std > 0.0 for stage in stages)
         start = [] if draws_noise else _start(points)
         schedule.plans[key] = [*start, *stages, Stage(*points[0], is_last=True)]
     return schedule.plans[key]
