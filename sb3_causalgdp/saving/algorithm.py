@@ -35,6 +35,10 @@ NETWORKS = ("policy", "actor", "critic", "world_model")
 SelfAlgorithm = TypeVar("SelfAlgorithm", bound="SavedAlgorithm")
 
 
+# What models did before there were these arguments, and still do
+FIRST_VALUES: dict[str, Any] = {"target_policy_noise": 0.0, "pessimism": 1.0, "causal_abstraction": False}
+
+
 class SavedAlgorithm(DiscoveringAlgorithm):
     """
     An algorithm whose files are either whole or refused, and run nothing that they bring.
@@ -198,10 +202,9 @@ class SavedAlgorithm(DiscoveringAlgorithm):
                 values = {**saved.plain, **given}
                 # SB3 replaces only what its own entry names
                 more = {name: value for name, value in values.items() if name in LARGE and name not in saved.named}
-                first = {"pessimism": 1.0, "causal_abstraction": False}
-                more |= {name: value for name, value in first.items() if name not in saved.named}
+                more |= {name: value for name, value in FIRST_VALUES.items() if name not in saved.named}
                 if "target_policy_noise" not in saved.named:
-                    more |= {"_has_first_defaults": True, "target_policy_noise": 0.0}
+                    more["_has_first_defaults"] = True
                 model = super().load(
                     file,
                     env,
