@@ -29,6 +29,7 @@ from sb3_causalgdp.counterfactual import check_exchangeable
 from sb3_causalgdp.names import found_names
 from sb3_causalgdp.offline.algorithm import OfflineToOnlineAlgorithm
 from sb3_causalgdp.policies import CausalGDPPolicy, DiffusionActor
+from sb3_causalgdp.sources.chunks import Source
 from sb3_causalgdp.sources.rewards import RewardTransform
 from sb3_causalgdp.updates import Updates
 
@@ -264,6 +265,19 @@ class DiscoveringAlgorithm(OfflineToOnlineAlgorithm):
             # A loaded model, whose statistics know these rows
             self._fed_offline_position = self.offline_buffer.size()
         return self
+
+    def _check_names(self, data: Source) -> None:
+        variables = self.transition_variables
+        for what, given, own in (
+            ("states", data.state_names, variables.state_names),
+            ("actions", data.action_names, variables.action_names),
+        ):
+            # The values of a text column are coded against its most frequent one: level=high
+            common = {name.partition("=")[0] for name in given or ()} & {name.partition("=")[0] for name in own}
+            if common and tuple(given or ()) != tuple(own):
+                raise ValueError(
+                    f"{data.name}: {what} must be {list(own)}, in this order, as the model has them, got {list(given or ())}"
+                )
 
     def _transform_collected(self, transform: RewardTransform) -> None:
         super()._transform_collected(transform)

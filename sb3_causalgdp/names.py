@@ -70,7 +70,8 @@ def found_names(env: VecEnv | gym.Env | None) -> tuple[Names | None, Names | Non
     Names of the components of an observation and of the actions: the attributes ``state_names`` and ``action_names`` of
     the environment or of one of its wrappers; else the keys of a dictionary, also of a flattened one; else the joints and
     actuators of MuJoCo's models; else those that Gymnasium documents for its own environments. A wrapper that changes
-    observations hides what lies below, unless it has the attribute.
+    observations hides what lies below, unless it has the attribute, or says by ``added_state_names`` and
+    ``added_action_names`` what it appends.
 
     :param env: The environment, or several of one kind
     :return: Of the states and of the actions; None for those that were not found
@@ -109,6 +110,7 @@ def _of_one(env: gym.Env | None) -> tuple[Names | None, Names | None]:
     if env is None:
         return None, None
     states, actions = (_names_in(env, attribute) for attribute in ("state_names", "action_names"))
+    states, actions = states or _with_added(env, "state_names"), actions or _with_added(env, "action_names")
     if states is None:
         states = _names_of_keys(env)
     if states is None and not _is_changed(env, "state_names"):
@@ -120,6 +122,20 @@ def _of_one(env: gym.Env | None) -> tuple[Names | None, Names | None]:
 
 def _names_in(env: gym.Env, attribute: str) -> Names | None:
     return _as_names(env.get_wrapper_attr(attribute)) if env.has_wrapper_attr(attribute) else None
+
+
+def _with_added(env: gym.Env, attribute: str) -> Names | None:
+    """What is below a wrapper that appends components and says their names, and these."""
+    space = attribute.replace("names", "space").replace("state", "observation")
+    while isinstance(env, gym.Wrapper):
+        added = getattr(env, f"added_{attribute}", ())
+        if added:
+            below = _of_one(env.env)[attribute == "action_names"]
+            return None if below is None else (*below, *added)
+        if getattr(env, space) != getattr(env.env, space) and not _keeps_numbers(env):
+            return None
+        env = env.env
+    return None
 
 
 def _as_names(value: Any) -> Names | None:

@@ -76,7 +76,9 @@ OFFLINE: dict[str, dict[str, Any]] = {
     "qvpo": {**_OF_DIFFUSION_QL, "denoising_weight": 1.0},
 }
 
-NOT_CAUSAL: dict[str, Any] = {"guidance": None, "causal_abstraction": False}
+# Guided and not, they differ in the guidance alone
+NOT_ABSTRACTING: dict[str, Any] = {"causal_abstraction": False}
+NOT_GUIDED: dict[str, Any] = {"guidance": None}
 
 PRESETS = tuple(METHODS)
 
@@ -98,7 +100,7 @@ def preset(name: str, offline: bool = False, guided: bool = False, **changes: An
         close = difflib.get_close_matches(str(name), PRESETS, n=1)
         hint = f", did you mean {close[0]!r}?" if close else ""
         raise ValueError(f"preset must be one of {list(PRESETS)}, got {name!r}{hint}")
-    parts: list[Mapping[str, Any]] = [METHODS[name], {} if guided else NOT_CAUSAL, changes]
+    parts: list[Mapping[str, Any]] = [METHODS[name], NOT_ABSTRACTING, {} if guided else NOT_GUIDED, changes]
     if offline:
         # What makes the method wins over the settings that it shares with others
         parts.insert(0, OFFLINE[name])

@@ -1,6 +1,6 @@
 """What a user asks a model: interventions, effects of actions, counterfactuals, in the environment's own units."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -21,6 +21,7 @@ from sb3_causalgdp.causal.rows import as_numbers
 from sb3_causalgdp.causal.world_model import MaskedWorldModel
 from sb3_causalgdp.offline.algorithm import OfflineToOnlineAlgorithm
 from sb3_causalgdp.policies import CausalGDPPolicy
+from sb3_causalgdp.sources.columns import columns_of, is_frame
 
 Observations = np.ndarray | dict[str, np.ndarray]
 
@@ -70,7 +71,7 @@ class AskedAlgorithm(OfflineToOnlineAlgorithm):
         :return: See :meth:`~sb3_causalgdp.causal.StructuralModel.intervene`
         """
         model = self.structural_model()
-        states, actions = self._states_of(observation), actions_of(self.policy, action)
+        states, actions = self._states_of(observation), self._actions_of(action)
         return model.intervene(states, actions, self._by_name(interventions), n_samples)
 
     def effect_of_actions(
@@ -88,7 +89,7 @@ class AskedAlgorithm(OfflineToOnlineAlgorithm):
         :return: Averages over the observations, see :meth:`~sb3_causalgdp.causal.StructuralModel.effect_of_actions`
         """
         model = self.structural_model()
-        return model.effect_of_actions(self._states_of(observations), actions_of(self.policy, actions), delta)
+        return model.effect_of_actions(self._states_of(observations), self._actions_of(actions), delta)
 
     def counterfactual(
         self,
@@ -109,20 +110,32 @@ class AskedAlgorithm(OfflineToOnlineAlgorithm):
         :return: States, actions, rewards and noise, in the environment's units
         """
         model = self.structural_model()
+        if not isinstance(trajectory, tuple | list) or len(trajectory) != 3:
+            raise ValueError(
+                "trajectory must be (observations, actions, rewards) of one episode, T + 1 and twice T of them, got "
+                f"{type(trajectory).__name__}"
+            )
         observations, actions, rewards = trajectory
-        recorded = (self._states_of(observations), actions_of(self.policy, actions), rewards)
+        recorded = (self._states_of(observations), self._actions_of(actions), rewards)
         policy = StatePolicy(self.policy, self._vec_normalize_env) if follow_policy else None
         return model.counterfactual(recorded, self._by_name(changes), policy)
 
     def _by_name(self, values: Mapping[str, Any]) -> dict[str, Any]:
         """What has the index of a variable gets its name."""
+        if not isinstance(values, Mapping):
+            like = f"{{{self.transition_variables.action_names[0]!r}: 1.0}}"
+            raise ValueError(f"values must be given by name, like {like}, got {values!r}")
         names = dict(zip(self._indices.names, self.transition_variables.names, strict=True))
         return {
             name if name in self.transition_variables.names else names.get(name, name): value for name, value in values.items()
         }
 
     def _states_of(self, observation: Any) -> np.ndarray:
-        return states_of(self.policy, observation, self._vec_normalize_env)
+        rows = _by_column("observation", observation, self.transition_variables.state_names)
+        return states_of(self.policy, rows, self._vec_normalize_env)
+
+    def _actions_of(self, action: Any) -> np.ndarray:
+        return actions_of(self.policy, _by_column("action", action, self.transition_variables.action_names))
 
 
 # Between SB3's observations and the structural model's rows: normalisation, dictionaries, one observation or many --------
@@ -168,6 +181,17 @@ def _state_maps(policy: CausalGDPPolicy, normalizer: VecNormalize) -> tuple[npt.
             columns.append((statistics.mean.flatten(), scale.flatten(), np.full(size, normalizer.clip_obs)))
     offset, scale, clip = (np.concatenate(values) for values in zip(*columns, strict=True))
     return offset, scale, clip
+
+
+def _by_column(what: str, values: Any, names: Sequence[str]) -> Any:
+    """Rows of a data frame in the order of the variables; anything else as it is."""
+    if not is_frame(values):
+        return values
+    columns = columns_of(values)
+    missing = [name for name in names if name not in columns]
+    if missing:
+        raise ValueError(f"{what} must have the columns {list(names)}, got {list(columns)}")
+    return np.column_stack([columns[name] for name in names])
 
 
 def states_of(policy: CausalGDPPolicy, observation: Any, normalizer: VecNormalize | None = None) -> np.ndarray:

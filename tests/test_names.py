@@ -4,10 +4,11 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 import pytest
+from gymnasium import spaces
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecFrameStack, VecNormalize
 
-from sb3_causalgdp import CausalGDP
+from sb3_causalgdp import CausalGDP, stress
 from sb3_causalgdp.causal import TransitionVariables
 from sb3_causalgdp.causal.sources import FlatSpace
 from sb3_causalgdp.names import found_names
@@ -253,3 +254,17 @@ def test_wrong_names_are_refused(names):
 def test_models_that_were_trained_without_names_keep_their_indices():
     model = CausalGDP.load(Path(__file__).parent / "data" / "model_of_0_1.zip", make_vec_env("Pendulum-v1"))
     assert model.transition_variables.names[:4] == ("obs[0]", "obs[1]", "obs[2]", "action[0]")
+
+
+def test_what_a_stress_wrapper_appends_has_a_name_and_the_rest_keeps_its_own():
+    env = stress.IdleActions(stress.LastAction(stress.NoiseDistractors(gym.make("Pendulum-v1"), n=2)), n=2)
+    names = ("cos angle", "sin angle", "vel angle", "noise 1", "noise 2", "last action 1"), ("torque", "idle 1", "idle 2")
+    assert found_names(env) == names
+    assert found_names(make_vec_env(lambda: env)) == names
+    other = stress.OtherEnvironment(gym.make("Pendulum-v1"), controlled=True)
+    assert found_names(other)[0][3:] == ("other 1", "other 2", "other 3")
+    assert found_names(other)[1] == ("torque", "other action 1")
+    # Of what lies below, nothing is known
+    below = gym.wrappers.TransformObservation(gym.make("Pendulum-v1"), lambda obs: obs[:2], spaces.Box(-1.0, 1.0, (2,)))
+    assert found_names(stress.NoiseDistractors(below, n=1))[0] is None
+    assert CausalGDP("MlpPolicy", env, buffer_size=10).transition_variables.state_names == names[0]

@@ -52,12 +52,12 @@ def make_parser() -> argparse.ArgumentParser:
         "next_observations and rewards",
     )
     table = parser.add_argument_group("columns of a table").add_argument
-    table("--state", metavar="NAMES", help="columns of the state, such as level,temperature")
-    table("--action", metavar="NAMES", help="columns of the action")
+    table("--state", "--states", metavar="NAMES", help="columns of the state, such as level,temperature")
+    table("--action", "--actions", metavar="NAMES", help="columns of the action")
     table("--reward", metavar="NAME", help="column of the reward")
     table("--episode", metavar="NAME", help="column that tells episodes apart (all rows are one)")
     table("--time", metavar="NAME", help="column that must grow within an episode; no transition over a gap")
-    table("--next-state", metavar="NAMES", help="columns of the next state (the state --lag rows later)")
+    table("--next-state", "--next-states", metavar="NAMES", help="columns of the next state (the state --lag rows later)")
     table("--lag", type=_positive, default=1, metavar="N", help="rows from a state to the next one (%(default)s)")
     table("--drop-missing", action="store_true", help="leave out transitions with a missing value")
     add("--state-names", metavar="NAMES", help="of a source that is no table: what to call its states (obs[0], obs[1], ...)")

@@ -1,5 +1,6 @@
 """What the structural model answers: numbers with their names, as tables and as pictures."""
 
+import difflib
 import os
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -58,7 +59,8 @@ class InterventionalDistribution:
             return tuple(self)[name]
         names = (*self.variables.next_state_names, "reward")
         if name not in names:
-            raise KeyError(f"unknown outcome {name!r}, known are {names}")
+            close = difflib.get_close_matches(name, names, n=1)
+            raise KeyError(f"unknown outcome {name}, {f'did you mean {close[0]}' if close else f'known are {list(names)}'}")
         column = names.index(name)
         return tuple(values[..., column] for values in self.columns())
 

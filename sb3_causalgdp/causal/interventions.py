@@ -421,6 +421,9 @@ class StructuralModel:
 
     def _action_rules(self, changes: Mapping[str, npt.ArrayLike | ActionRule], n_steps: int) -> dict[int, ActionRule]:
         names = self.variables.action_names
+        states = [name for name in changes if name in (*self.variables.state_names, *self.variables.next_state_names)]
+        if states:
+            raise ValueError(f"a counterfactual changes actions, {list(names)}, got the state {states[0]!r}")
         self._check_names(changes, names)
         rules: dict[int, ActionRule] = {}
         for name, change in changes.items():

@@ -123,7 +123,7 @@ def is_checkpoint(path: Path) -> bool:
         return MANIFEST in archive.namelist()
 
 
-class _NotWhole(ValueError):
+class CheckpointError(ValueError):
     """What is wrong with a checkpoint."""
 
 
@@ -135,7 +135,7 @@ def _newest_whole(path: Path) -> Checkpoint:
     for candidate in candidates:
         try:
             return _checked(candidate, _reader(candidate))
-        except _NotWhole as error:
+        except CheckpointError as error:
             problems.append(str(error))
     raise ValueError(f"no checkpoint is whole: {'; '.join(problems)}")
 
@@ -154,6 +154,8 @@ def _opened_zip(path: Path, stack: ExitStack) -> Checkpoint:
     try:
         archive = stack.enter_context(zipfile.ZipFile(path))
         checked_entries(archive, path.stat().st_size)
+        if MANIFEST not in archive.namelist():
+            raise ValueError(f"it has no {MANIFEST}; a saved model is loaded by load()")
     except (zipfile.BadZipFile, ValueError, NotImplementedError) as error:
         raise ValueError(f"{path} is no checkpoint: {error}") from error
     return _checked(path, lambda name: io.BytesIO(archive.read(name)))
@@ -164,19 +166,19 @@ def _checked(path: Path, read: Callable[[str], BinaryIO]) -> Checkpoint:
         with read(MANIFEST) as file:
             manifest = json.loads(file.read())
         if manifest["checksum"] != _checksum(manifest):
-            raise _NotWhole(f"{path}: {MANIFEST} is not what was written")
+            raise CheckpointError(f"{path}: {MANIFEST} is not what was written")
         if manifest["format"] > FORMAT:
-            raise _NotWhole(f"{path} is of format {manifest['format']}, this version reads up to {FORMAT}")
+            raise CheckpointError(f"{path} is of format {manifest['format']}, this version reads up to {FORMAT}")
         for name, expected in manifest["files"].items():
             if Path(name).name != name.removeprefix(f"{FOLDER}/"):
-                raise _NotWhole(f"{path}: {name!r} is no file of a checkpoint")
+                raise CheckpointError(f"{path}: {name!r} is no file of a checkpoint")
             with read(name) as file:
                 if _digest(file) != expected:
-                    raise _NotWhole(f"{path}: {name} is not what was written")
+                    raise CheckpointError(f"{path}: {name} is not what was written")
     except (OSError, ValueError, KeyError, TypeError, AttributeError, zipfile.BadZipFile) as error:
-        if isinstance(error, _NotWhole):
+        if isinstance(error, CheckpointError):
             raise
-        raise _NotWhole(f"{path}: {type(error).__name__} {error}") from error
+        raise CheckpointError(f"{path}: {type(error).__name__} {error}") from error
     return Checkpoint(path, manifest, read)
 
 

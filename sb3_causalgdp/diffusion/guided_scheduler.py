@@ -139,6 +139,12 @@ class GuidedScheduler:
         position: int | None = None,
         clip: float | None = 1.0,
     ) -> None:
+        if not callable(getattr(scheduler, "step", None)) or not hasattr(scheduler, "config"):
+            raise TypeError(f"scheduler must be an object of diffusers, like DDIMScheduler(), got {scheduler!r}")
+        if guidance is not None and not callable(guidance):
+            raise TypeError(f"guidance must be a function of actions or None, got {guidance!r}")
+        if position is not None and (isinstance(position, bool) or not isinstance(position, int)):
+            raise TypeError(f"position must be an integer or None, got {position!r}")
         self.scheduler = scheduler
         self.guidance = guidance
         self.rule = GuidanceRule() if rule is None else rule

@@ -85,6 +85,7 @@ class BufferedAlgorithm(LaidOutAlgorithm):
         if columns:
             raise TypeError(f"preload() got an unexpected keyword argument {next(iter(columns))!r}")
         data = open_source(table, download, trusted)
+        self._check_names(data)
         name = self.reward_transform if reward_transform is None else reward_transform
         if self._reward_transform is not None and name != self.reward_transform:
             raise ValueError(f"The model's rewards are transformed by {self.reward_transform!r} already, got {name!r}")
@@ -102,6 +103,9 @@ class BufferedAlgorithm(LaidOutAlgorithm):
         self.reward_transform, self._reward_transform = name, done.reward_transform
         self._offline_marks.append(done.mark)
         return self
+
+    def _check_names(self, data: Source) -> None:
+        """Whether the columns of a table are the model's variables, where these have names."""
 
     def _transform_collected(self, transform: RewardTransform) -> None:
         """The rewards of transitions that were collected before the model knew of a transform."""

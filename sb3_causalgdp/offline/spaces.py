@@ -29,7 +29,7 @@ def spaces_of(
         assert isinstance(source, ArraySource)
         known |= {name: inferred_space(source, name) for name in unknown}
         said = ", ".join(f"{name}={known[name]}" for name in unknown)
-        warnings.warn(f"{source.name}: spaces are inferred, {said}; give them where they are others")
+        warnings.warn(f"{source.name}: spaces are inferred, {said}; give observation_space= or action_space= if this is wrong")
     if not isinstance(known["action_space"], spaces.Box):
         raise ValueError(f"continuous actions (a Box) are needed, got action_space={known['action_space']}")
     return known["observation_space"], known["action_space"]  # type: ignore[return-value]

@@ -1,10 +1,11 @@
 """Saving and loading models, all or nothing, and training checkpoints."""
 
+import difflib
 import io
 import os
 import pathlib
 import warnings
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from copy import deepcopy
 from typing import Any, TypeVar
 
@@ -199,6 +200,8 @@ class SavedAlgorithm(DiscoveringAlgorithm):
         try:
             with errors_of(path, "cannot be loaded"):
                 saved = read_values(file, cls._known_classes(), given, trusted, cls)
+            _check_known(kwargs, saved.named)
+            with errors_of(path, "cannot be loaded"):
                 values = {**saved.plain, **given}
                 # SB3 replaces only what its own entry names
                 more = {name: value for name, value in values.items() if name in LARGE and name not in saved.named}
@@ -334,3 +337,13 @@ class SavedAlgorithm(DiscoveringAlgorithm):
         self.set_random_seed(int(np.random.SeedSequence().generate_state(1)[0] >> 1))
         warnings.warn(f"{error} It goes on from {folders[0]} after {self.num_timesteps} steps, with other random numbers.")
         return True
+
+
+def _check_known(kwargs: Iterable[str], named: Collection[str]) -> None:
+    """A misspelt argument would become an attribute that nothing reads."""
+    known = {*CONSTRUCTOR_ARGUMENTS, *named}
+    for name in kwargs:
+        if name not in known:
+            close = difflib.get_close_matches(name, known, n=1)
+            hint = f", did you mean {close[0]!r}?" if close else ""
+            raise TypeError(f"load() got an unexpected keyword argument {name!r}{hint}")

@@ -145,7 +145,8 @@ def read_values(file: BinaryIO, known: Known, given: Collection[str], trusted: b
             _check_tensors(archive, entries)
         saved = read_json(archive.read("data")) if "data" in archive.namelist() else None
         if not isinstance(saved, dict):
-            raise ValueError("it holds no attributes of a model")
+            raise ValueError("it holds no attributes of a model: a policy that was saved alone is loaded by MlpPolicy.load")
+        _check_algorithm(saved)
         plain = read_plain(archive, known, given)
     file.seek(position)
     if not trusted:
@@ -192,6 +193,14 @@ def read_plain(archive: zipfile.ZipFile, known: Known, given: Collection[str] = 
     if CONTENT not in archive.namelist():
         return {}
     return decoded(read_json(archive.read(CONTENT)), archive.read(BLOCK), known, given)
+
+
+def _check_algorithm(saved: Mapping[str, Any]) -> None:
+    """A file of another algorithm is not asked to be trusted."""
+    policy = saved.get("policy_class")
+    module = policy.get("__module__") if isinstance(policy, dict) else None
+    if isinstance(module, str) and module.split(".")[0] in ("stable_baselines3", "sb3_contrib"):
+        raise ValueError(f"it is a model of another algorithm, whose policy is of {module}")
 
 
 def _check_attributes(read: Mapping[str, Any], saved: Mapping[str, Any], plain: Mapping[str, Any], cls: type) -> None:

@@ -2,6 +2,7 @@
 
 import io
 import pickle
+import zipfile
 from collections.abc import Mapping
 from typing import Any, BinaryIO, TypeVar
 
@@ -132,6 +133,13 @@ def _read_policy(
     file: BinaryIO, device: th.device, trusted: bool, known: Known
 ) -> tuple[dict[str, th.Tensor], dict[str, Any]]:
     """Parameters, and the arguments of the constructor."""
+    position = file.tell()
+    if zipfile.is_zipfile(file):
+        file.seek(position)
+        with zipfile.ZipFile(file) as archive:
+            if "pytorch_variables.pth" in archive.namelist():
+                raise ValueError("it is a whole model, which CausalGDP.load loads")
+    file.seek(position)
     if trusted:
         saved = th.load(file, map_location=device, weights_only=False)
     else:

@@ -20,6 +20,7 @@ SUFFIXES = (".npz", ".pkl")
 CONTENT, BLOCK, OFFLINE = "buffer", "block", "offline/"
 # Attributes that our algorithm gives a buffer while it is written
 ADDED = ("saved_after", "observation_layout", "reward_transform")
+HOW_TO_SAVE = "save one with model.save_replay_buffer(path)"
 MOST_ROWS = 100_000_000
 RECORDED_ROWS = 4096  # a batch of discovery, which copies nothing then
 COLUMNS = ("observations", "actions", "rewards", "dones")
@@ -262,7 +263,14 @@ def content_of(path: Any, trusted: bool = False) -> tuple[dict[str, np.ndarray] 
     :raises ValueError: If it is neither
     """
     with opened(path) as file:
-        return (read_arrays(file), None) if is_zip(file) else (None, read_pickle(file, trusted))
+        if not is_zip(file):
+            return None, read_pickle(file, trusted)
+        position = file.tell()
+        with zipfile.ZipFile(file) as archive:
+            if "pytorch_variables.pth" in archive.namelist():
+                raise ValueError(f"{named(path)} is a model, which is saved without its buffer: {HOW_TO_SAVE}")
+        file.seek(position)
+        return read_arrays(file), None
 
 
 def no_buffer_error(content: Any, path: Any) -> ValueError:
@@ -272,7 +280,7 @@ def no_buffer_error(content: Any, path: Any) -> ValueError:
     :return: What to raise
     """
     kind = type(content).__name__
-    return ValueError(f"{named(path)} holds no replay buffer but a {kind}: save one with model.save_replay_buffer(path)")
+    return ValueError(f"{named(path)} holds no replay buffer but a {kind}: {HOW_TO_SAVE}")
 
 
 def split_arrays(arrays: dict[str, np.ndarray]) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:

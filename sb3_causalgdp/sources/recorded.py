@@ -106,7 +106,8 @@ def open_source(source: Any, download: bool = True, trusted: bool = False) -> So
     if hasattr(source, "iterate_episodes"):
         return MinariSource(source)
     raise TypeError(
-        "A source is the id of a Minari dataset, a MinariDataset, a replay buffer, a path or a mapping of arrays, "
+        "A source is the id of a Minari dataset, a MinariDataset, a replay buffer, a path, a mapping of arrays, or a table "
+        "(a data frame or a path, with states=[...], actions=[...], reward=...), "
         f"got {type(source).__name__}"
     )
 

@@ -57,6 +57,7 @@ class Table:
         self.remarks: tuple[str, ...] = ()
         _check_options(missing, lag)
         columns = columns_of(source)
+        reward = _one_name("reward", reward)
         roles = _checked_roles(self.name, columns, states, actions, reward, next_states)
         for role, chosen in (("episode", episode), ("time", time)):
             if chosen is not None:
@@ -133,6 +134,13 @@ def _check_options(missing: str, lag: int) -> None:
         raise ValueError(f"missing must be one of {MISSING}, got {missing!r}")
     if isinstance(lag, bool) or not isinstance(lag, int) or lag < 1:
         raise ValueError(f"lag must be an integer of at least 1, got {lag!r}")
+
+
+def _one_name(role: str, name: Any) -> str:
+    names = [name] if isinstance(name, str) else list(name) if isinstance(name, list | tuple) else [str(name)]
+    if len(names) != 1:
+        raise ValueError(f"{role} must be the name of one column, got {name!r}")
+    return names[0]
 
 
 def _checked_roles(

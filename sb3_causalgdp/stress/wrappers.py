@@ -18,6 +18,10 @@ def _positive_integer(name: str, value: Any, smallest: int = 1) -> int:
     return int(value)
 
 
+def _numbered(what: str, n: int) -> tuple[str, ...]:
+    return tuple(f"{what} {index}" for index in range(1, n + 1))
+
+
 def _flat_box(env: gym.Env, of: str) -> spaces.Box:
     space = env.observation_space if of == "observation" else env.action_space
     if not isinstance(space, spaces.Box) or len(space.shape) != 1:
@@ -37,6 +41,11 @@ class _Stress(gym.Wrapper, RecordConstructorArgs):
 
     # So that the numbers of two wrappers with the same seed differ
     STREAM: ClassVar[int] = 0
+
+    added_state_names: tuple[str, ...] = ()
+    """Names of what is appended to the observation."""
+    added_action_names: tuple[str, ...] = ()
+    """Names of what is appended to the action."""
 
     def __init__(self, env: gym.Env, **arguments: Any) -> None:
         RecordConstructorArgs.__init__(self, **arguments)
@@ -66,6 +75,8 @@ class _MoreObservations(_Stress):
 class _AutoregressiveNoise(_MoreObservations):
     """Appends stationary AR(1) noise of variance 1."""
 
+    KIND: ClassVar[str] = "noise"
+
     def __init__(self, env: gym.Env, n: int, coefficient: float, **arguments: Any) -> None:
         n = _positive_integer("n", n)
         if not 0 <= coefficient < 1:
@@ -74,6 +85,7 @@ class _AutoregressiveNoise(_MoreObservations):
         self._coefficient = float(coefficient)
         self._noise = np.zeros(n)
         self._append(np.full(n, -np.inf), np.full(n, np.inf))
+        self.added_state_names = _numbered(self.KIND, n)
 
     def _after_reset(self, observation: np.ndarray, seed: int | None) -> np.ndarray:
         self._noise = self._generator.standard_normal(len(self._noise))
@@ -120,6 +132,7 @@ class Nuisance(_AutoregressiveNoise):
     """
 
     STREAM = 2
+    KIND = "nuisance"
     FACTORS: ClassVar[dict[str, float]] = {"present": 1.0, "gone": 0.0, "changed": -2.0}
 
     def __init__(self, env: gym.Env, mode: str = "present", n: int = 1, coefficient: float = 0.95) -> None:
@@ -183,8 +196,10 @@ class OtherEnvironment(_MoreObservations):
         of_one, actions = _flat_box(self._others[0], "observation"), _flat_box(self._others[0], "action")
         self._n_actions = copies * actions.shape[0]
         self._append(np.tile(of_one.low, copies), np.tile(of_one.high, copies))
+        self.added_state_names = _numbered("other", copies * of_one.shape[0])
         self._n_own = _flat_box(env, "action").shape[0]
         if controlled:
+            self.added_action_names = _numbered("other action", self._n_actions)
             self.action_space = _extended(
                 _flat_box(env, "action"), np.tile(actions.low, copies), np.tile(actions.high, copies)
             )
@@ -230,6 +245,7 @@ class IdleActions(_Stress):
         own = _flat_box(env, "action")
         self._n_own = own.shape[0]
         self.action_space = _extended(own, -np.ones(n), np.ones(n))
+        self.added_action_names = _numbered("idle", n)
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         return self.env.step(action[: self._n_own])
@@ -249,6 +265,7 @@ class LastAction(_MoreObservations):
         space = _flat_box(env, "action")
         self._append(np.minimum(space.low, 0.0), np.maximum(space.high, 0.0))
         self._n_own = space.shape[0]
+        self.added_state_names = _numbered("last action", self._n_own)
 
     def _after_reset(self, observation: np.ndarray, seed: int | None) -> np.ndarray:
         return self._appended(observation, np.zeros(self._n_own))

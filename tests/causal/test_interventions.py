@@ -450,7 +450,7 @@ def test_bad_trajectories_and_changes_are_errors(linear):
         with pytest.raises(ValueError, match=message):
             linear.counterfactual(trajectory, {})
     for changes, message in (
-        ({"x": 1.0}, r"Unknown variables \['x'\]: known are \['u', 'v'\]"),
+        ({"x": 1.0}, r"a counterfactual changes actions, \['u', 'v'\], got the state 'x'"),
         ({"u": [0.1, 0.2]}, r"u must be a number or have shape \(4,\), got \(2,\)"),
         ({"u": np.nan}, "u must be set to finite values, got nan"),
         ({"u": 1.5}, r"u must be in \[-1, 1\], got 1.5 \(in changes, step 0"),

@@ -273,3 +273,16 @@ def test_cost_of_guidance_is_less_than_a_small_network():
     guided = GuidedScheduler(scheduler_of("DDIMScheduler", "sample"), pull_to(0.3, seen=calls))
     chain(guided, standard_normal, th.zeros(2, 3))
     assert len(calls) == 20 and math.isfinite(float(calls[-1].sum()))
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "message"),
+    [
+        ({"scheduler": "ddim"}, "scheduler must be an object of diffusers"),
+        ({"guidance": 0.5}, "guidance must be a function of actions or None, got 0.5"),
+        ({"position": "first"}, "position must be an integer or None, got 'first'"),
+    ],
+)
+def test_arguments_of_another_kind_are_refused_at_construction(kwargs, message):
+    with pytest.raises(TypeError, match=message):
+        GuidedScheduler(**{"scheduler": diffusers.DDIMScheduler(), **kwargs})

@@ -95,3 +95,54 @@ def test_a_frame_is_preloaded_by_the_names_of_its_columns():
         found.preload(frame, states=["level"], reward="cost")
     with pytest.raises(TypeError, match="unexpected keyword argument 'rewards'"):
         found.preload(frame, rewards="cost")
+
+
+def test_columns_that_are_not_the_model_s_are_refused():
+    columns = {"states": ["level", "temperature"], "actions": ["valve"], "reward": "cost", "episode": "run"}
+    model = make(make_frame(), **columns)
+    with pytest.raises(
+        ValueError, match=r"states must be \['level', 'temperature'\], in this order.*\['temperature', 'level'\]"
+    ):
+        model.preload(make_frame(), **{**columns, "states": ["temperature", "level"]})
+    renamed = make_frame().rename(columns={"level": "lvl"})
+    with pytest.raises(ValueError, match=r"got \['lvl', 'temperature'\]"):
+        model.preload(renamed, **{**columns, "states": ["lvl", "temperature"]})
+    assert model.offline_buffer is None
+
+
+def test_a_text_column_that_is_coded_otherwise_is_refused():
+    columns = {"states": ["level"], "actions": ["pump"], "reward": "cost", "episode": "run"}
+    mostly_on, mostly_off = (make_frame() for _ in range(2))
+    mostly_on["pump"] = np.where(np.arange(400) % 5 < 3, "on", "off")
+    mostly_off["pump"] = np.where(np.arange(400) % 5 < 2, "on", "off")
+    model = make(mostly_on, **columns).preload(mostly_on, **columns)
+    with pytest.raises(ValueError, match=r"actions must be \['pump=off'\].*got \['pump=on'\]"):
+        model.preload(mostly_off, **columns)
+
+
+def test_a_model_without_names_of_its_own_takes_columns_by_position():
+    columns = {"states": ["level", "temperature"], "actions": ["valve"], "reward": "cost", "episode": "run"}
+    frame = make_frame()
+    expected = Table(frame, **columns)
+    arrays = {name: getattr(expected, name) for name in ("observations", "actions", "next_observations", "rewards")}
+    ends = {"terminations": np.zeros(len(expected), bool), "truncations": expected.is_last}
+    model = make({**arrays, **ends}).preload(frame, **columns)
+    np.testing.assert_allclose(model.offline_buffer.observations[: len(expected), 0], expected.observations, rtol=1e-6)
+
+
+def test_questions_about_a_frame_are_by_the_names_of_its_columns():
+    columns = {"states": ["level", "temperature"], "actions": ["valve"], "reward": "cost", "episode": "run"}
+    frame = make_frame()
+    model = make(frame, **columns).preload(frame, **columns).pretrain(4)
+    plain = model.effect_of_actions(frame[["level", "temperature"]].to_numpy(), frame[["valve"]].to_numpy())
+    swapped = model.effect_of_actions(frame[["temperature", "run", "level"]], frame[["valve"]])
+    np.testing.assert_array_equal(swapped.next_state.mean, plain.next_state.mean)
+    with pytest.raises(ValueError, match=r"observation must have the columns \['level', 'temperature'\], got \['level'\]"):
+        model.intervene(frame[["level"]], frame[["valve"]], {})
+
+
+@pytest.mark.parametrize("reward", [["cost"], ("cost",)])
+def test_a_list_of_one_reward_is_one_reward(reward):
+    assert len(Table(make_frame(), states=["level"], actions=["valve"], reward=reward)) == 399
+    with pytest.raises(ValueError, match="reward must be the name of one column"):
+        Table(make_frame(), states=["level"], actions=["valve"], reward=["cost", "run"])

@@ -14,6 +14,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
+from stable_baselines3 import SAC
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.save_util import load_from_zip_file
@@ -542,3 +543,27 @@ def test_the_environment_of_a_dataset_is_not_made(tmp_path, monkeypatch):
     with pytest.raises(Exception, match=""):
         minari.load_dataset("strange/data-v0")
     assert mark.exists()
+
+
+# Files of another kind --------------------------------------------------------------------------------------------------
+
+
+def test_a_file_of_another_kind_is_told_apart(model, saved, tmp_path):
+    model.policy.save(tmp_path / "policy.zip")
+    with pytest.raises(ValueError, match=r"loaded by MlpPolicy.load"):
+        CausalGDP.load(tmp_path / "policy.zip")
+    with pytest.raises(ValueError, match=r"it is a whole model, which CausalGDP.load loads"):
+        MlpPolicy.load(saved)
+    with pytest.raises(ValueError, match=r"is a model, which is saved without its buffer: save one with model.save_replay"):
+        model.load_replay_buffer(saved)
+    with pytest.raises(ValueError, match=r"is no checkpoint: it has no manifest.json; a saved model is loaded by load\(\)"):
+        CausalGDP.resume(saved, "Pendulum-v1")
+    SAC("MlpPolicy", "Pendulum-v1", buffer_size=10).save(tmp_path / "sac")
+    with pytest.raises(ValueError, match=r"it is a model of another algorithm, whose policy is of stable_baselines3.sac"):
+        CausalGDP.load(tmp_path / "sac")
+
+
+def test_a_misspelt_argument_of_load_is_refused(saved):
+    with pytest.raises(TypeError, match=r"unexpected keyword argument 'guidance_scal', did you mean 'guidance_scale'\?"):
+        CausalGDP.load(saved, guidance_scal=0.5)
+    assert CausalGDP.load(saved, num_timesteps=3, guidance_scale=0.5).num_timesteps == 3

@@ -178,6 +178,8 @@ def discover(
     """
     if rows is not None and variables is not None:
         return _discover(source, rows, variables, kwargs)
+    if isinstance(source, str) and source in DISCOVERY_METHODS:
+        raise ValueError(f"the table comes first, the method by name: discover(table, method={source!r}, states=[...], ...)")
     own = [name for name in inspect.signature(Table).parameters if name in kwargs]
     method = kwargs.pop("method", "partial_r2")
     if not isinstance(source, Table):
