@@ -12,12 +12,14 @@ from sb3_causalgdp.causal.discovery import regression as regressions
 from sb3_causalgdp.causal.discovery.evidence import edge_probability
 from sb3_causalgdp.causal.statistics.basis import BasisMoments
 from sb3_causalgdp.causal.statistics.jackknife import jackknife_error
+from sb3_causalgdp.stress import NoiseDistractors
 
 # The benchmarks are not part of the installed package
 sys.path.append(str(Path(__file__).parents[2]))
 
 from benchmarks.discovery.metrics import auroc, ece, f1
 from benchmarks.discovery.systems import KINDS, make_system
+
 
 VARIABLES = TransitionVariables(("x", "y", "z"), ("push", "pull"))
 NO_SPREAD = 1e-9  # masks are 0 or 1, but for the error of the sample
@@ -612,3 +614,38 @@ def test_the_same_rows_give_the_same_graph_twice():
     first, second = method(statistics, VARIABLES), method(statistics, VARIABLES)
     for name in ("masks", "effects", "standard_errors", "r_squared"):
         np.testing.assert_array_equal(getattr(first, name), getattr(second, name))
+
+
+def pendulum_with_noise(n_rows, n_noises, seed=0):
+    """Random actions on a pendulum, which is smooth and has no noise of its own, beside observations that change as slowly."""
+    env = NoiseDistractors(gym.make("Pendulum-v1"), n=n_noises)
+    env.action_space.seed(seed)
+    rows, observation = [], env.reset(seed=seed)[0]
+    for _ in range(n_rows):
+        action = env.action_space.sample()
+        following, reward, _, cut, _ = env.step(action)
+        rows.append((observation, action, following, reward))
+        observation = env.reset()[0] if cut else following
+    variables = TransitionVariables(tuple(f"s{i}" for i in range(3 + n_noises)), ("torque",))
+    return variables.stack(*map(np.array, zip(*rows, strict=True))), variables
+
+
+@pytest.mark.parametrize(("n_rows", "n_noises"), [(1_000, 10), (3_000, 20), (5_000, 20)])
+def test_slow_noise_is_no_cause_of_a_model_s_slow_errors(n_rows, n_noises):
+    rows, variables = pendulum_with_noise(n_rows, n_noises)
+    evidence = discover("partial_r2", rows, variables).evidence
+    assert (evidence[:3, 3:-1] > 0.5).sum() == 0 and (evidence[-1, 3:-1] > 0.5).sum() == 0
+    of_pendulum = np.column_stack([evidence[:3, :3], evidence[:3, -1]])
+    assert (of_pendulum > 0.5).sum() >= 10
+
+
+def test_where_rich_features_only_follow_the_rows_simpler_ones_are_taken():
+    """A random walk's past predicts it by straight lines alone."""
+    rng = np.random.default_rng(0)
+    variables = TransitionVariables(tuple(f"s{i}" for i in range(8)), ("a",))
+    states, actions = np.cumsum(rng.normal(size=(201, 8)), axis=0), np.cumsum(rng.normal(size=(200, 1)), axis=0)
+    rows = variables.stack(states[:-1], actions, states[1:], rng.normal(size=200))
+    masks = discover("partial_r2", rows, variables).masks[:8]
+    assert (np.diag(masks) > 0.9).all()
+    others = masks[:, :8][~np.eye(8, dtype=bool)]
+    assert (others > 0.5).mean() < 0.1

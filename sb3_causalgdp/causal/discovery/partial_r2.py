@@ -33,7 +33,8 @@ class PartialR2:
     there are products, no larger than the mask), of those that are functions of the cause alone and of the one that is linear
     in it, corrected for the number of tests and for rows that depend on each other: by the factor by which the sums of
     features times residuals over blocks of rows vary more than those of independent rows (the design effect of cluster
-    sampling, Kish, 1965).
+    sampling, Kish, 1965), and by the factor by which residuals are larger in blocks that a fit has not seen: many slow
+    features follow the slow errors of a model that is not quite right.
 
     An effect is the difference of the target, in its standard deviations, when a cause moves from half a standard deviation
     below to half a one above, the others as they are: its size is the mean of the absolute difference over the newest 256
@@ -45,7 +46,9 @@ class PartialR2:
     that the world has changed: the rows before are forgotten (``causal.discovery.changes``).
 
     Linearly dependent variables are tested as a group and share its masks; variables that never move have no edges. Where rows
-    are few, the products are left out, then sine and tanh, then the square, so that there are two rows for each feature.
+    are few, the products are left out, then sine and tanh, then the square, so that there are two rows for each feature; and
+    where the residuals of most targets are three times as large in blocks that a fit has not seen, those of the simpler
+    features are taken that err least there.
 
     :param threshold: Partial R^2 at which a mask is one half, in (0, 1)
     :param spread: Uncertainty of the mask in ln(partial R^2), beside that of the sample, positive

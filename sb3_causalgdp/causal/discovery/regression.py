@@ -10,8 +10,8 @@ from scipy.linalg import cho_solve
 from sb3_causalgdp.causal.discovery.evidence import detectable_effect, edge_evidence
 from sb3_causalgdp.causal.statistics.basis import N_FUNCTIONS, BasisExpansion, BasisMoments
 from sb3_causalgdp.causal.statistics.degenerate import Degeneracy
-from sb3_causalgdp.causal.statistics.matrices import cholesky_in_place, inverse_in_place, symmetric_product
-from sb3_causalgdp.causal.statistics.moments import Moments, Spread, StreamingMoments, leave_one_out
+from sb3_causalgdp.causal.statistics.matrices import cholesky_in_place, inverse_in_place, product, symmetric_product
+from sb3_causalgdp.causal.statistics.moments import Moments, Spread, StreamingMoments, leave_one_out, merge
 
 RIDGE = 1e-6  # of a feature's variance: features of many causes may be almost dependent where the causes are not
 # Larger, so that where cos^2 + sin^2 is 1 in all rows, what is linear in the cosine is not taken for squares
@@ -19,6 +19,8 @@ RIDGE_OF_SQUARES_AND_PRODUCTS = 1e-5
 SMALLEST_RESIDUAL = 1e-9  # of the target's variance: what float32 rounding and the ridge leave of an exact function
 SMALLEST_DEVIATION = 1e-9  # in units of the standard deviation of all rows: below it, a column does not move in these rows
 THINNING = 8
+FOLDS = 4
+MOST_OVERFITTING = 3.0  # of half of the targets: above, simpler features say more
 CHANGES_AT_ONCE = 2**18  # so that they stay in the processor's cache
 
 
@@ -115,23 +117,16 @@ class Regression:
         self.n_features = expansion.n_features
         self.degeneracy = degeneracy
         self.blocks = moments.blocks
-        total = moments.total()
-        self.total: Spread = total
-        used = _affordable_features(expansion, degeneracy.kept, total.count)
-        self.used = np.isin(np.arange(self.n_features), used)
-        self.freedom = max(total.count - len(used) - 1.0, 1.0)
-        feature_deviation = total.standard_deviation()[: self.n_features]
-        # A feature that is not used, or does not move, has nothing in common with any other
-        moves = self.used & (feature_deviation > SMALLEST_DEVIATION)
-        self.inverse_scale = moves / np.where(moves, feature_deviation, 1.0)
         self.ridge = np.where(expansion.squares_and_products, RIDGE_OF_SQUARES_AND_PRODUCTS, RIDGE)
         spread = statistics.raw.spread()
         deviation = spread.standard_deviation()
         self.target_moves = ~spread.constant[targets]
         self.target_scale = np.where(self.target_moves, deviation[targets], 1.0)
 
-        factor = self._factor(total)
-        self.fit = self._fit(total, factor)
+        richest, *simpler = _affordable_features(expansion, degeneracy.kept, moments.count)
+        factor = self._fit_by(richest, moments)
+        if simpler and np.median(self.overfitting) > MOST_OVERFITTING:
+            factor = self._fit_by(min(simpler, key=lambda features: self._error_by(features, moments)), moments)
         self.raw_coefficients = self.fit.coefficients * th.from_numpy(self.inverse_scale)[:, None]
         self.penalty = self.ridge[:, None] * self.fit.coefficients.numpy()
         # In double precision: where features do not move, 1 / RIDGE here meets next to nothing in the scores
@@ -143,6 +138,27 @@ class Regression:
         self.whole = self._estimates(self.fit)
         self.design_effect = np.ones(self.shape[1])
         """Of each target; known after ``parts``."""
+
+    def _error_by(self, features: np.ndarray, moments: StreamingMoments) -> float:
+        """How far off these features are in rows that they were not fitted to: mean logarithm over the targets."""
+        self._fit_by(features, moments)
+        return float(np.log(np.maximum(self.unseen_residual, self.fit.residual)).mean())
+
+    def _fit_by(self, features: np.ndarray, moments: StreamingMoments) -> np.ndarray:
+        """Use these features alone; the factor of their second moments."""
+        total = moments.total()
+        self.total: Spread = total
+        self.used = np.isin(np.arange(self.n_features), features)
+        self.freedom = max(total.count - len(features) - 1.0, 1.0)
+        deviation = total.standard_deviation()[: self.n_features]
+        # A feature that is not used, or does not move, has nothing in common with any other
+        moves = self.used & (deviation > SMALLEST_DEVIATION)
+        self.inverse_scale = moves / np.where(moves, deviation, 1.0)
+        factor = self._factor(total)
+        self.fit = self._fit(total, factor)
+        self.unseen_residual = self._unseen_residual()
+        self.overfitting = self._overfitting()
+        return factor
 
     def r_squared(self) -> np.ndarray:
         """
@@ -162,7 +178,7 @@ class Regression:
             scores[:, i] = self._scores(block)
         # At the minimum all gradients add up to nothing
         np.negative(scores[:, :-1].sum(axis=1), out=scores[:, -1])
-        self.design_effect = self._design_effect(scores)
+        self.design_effect = self._design_effect(scores) * self.overfitting
         squares = [self._squares(block, scores[:, i]) for i, block in enumerate(self.blocks)]
         # One product for all blocks: each alone would read the whole inverse
         steps = symmetric_product(self.inverse, scores.reshape(self.n_features, -1)).reshape(scores.shape)
@@ -202,6 +218,39 @@ class Regression:
         residual = self.fit.residual * self.total.count / self.freedom
         independent = n_moving * residual * self.total.count * float(np.sum(shares * (1.0 - shares)))
         return np.maximum(np.einsum("ijk,ijk->k", scores, scores) / independent, 1.0)
+
+    def _unseen_residual(self) -> np.ndarray:
+        """Mean square of the residuals in rows that a fit has not seen, shape (m,)."""
+        n_folds = min(FOLDS, len(self.blocks))
+        if n_folds < 2:
+            return self.fit.residual
+        errors = np.zeros(self.shape[1])
+        for i in range(n_folds):
+            # From everywhere in the recording, so that no time of it is unseen
+            fold = merge(self.blocks[i::n_folds])
+            rest = merge([block for j, block in enumerate(self.blocks) if j % n_folds != i])
+            errors += self._squared_errors(self._fit(rest, self._factor(rest)), fold, rest)
+        return errors / self.total.count
+
+    def _overfitting(self) -> np.ndarray:
+        """
+        The same in units of what independent rows would give, at least 1, shape (m,). Many slow features follow the slow
+        errors of a model that is not quite right, and are no causes of them.
+        """
+        n_used, n_folds = int(self.used.sum()), min(FOLDS, len(self.blocks))
+        freedom = max(self.total.count * (n_folds - 1) / n_folds - n_used - 1.0, 1.0)
+        independent = self.fit.residual * self.total.count / self.freedom * (1.0 + n_used / freedom)
+        return np.maximum(self.unseen_residual / independent, 1.0)
+
+    def _squared_errors(self, fit: Fit, rows: Moments, fitted: Moments) -> np.ndarray:
+        """Of a fit to other rows, their sum, in units of the targets' deviations in all rows, shape (m,)."""
+        coefficients = fit.coefficients.numpy() * self.inverse_scale[:, None]
+        errors = rows.squares[self.n_features :] / self.target_scale**2
+        errors -= 2.0 * np.einsum("ij,ij->j", coefficients, rows.cross / self.target_scale)
+        errors += np.einsum("ij,ij->j", coefficients, product(rows.comoment, coefficients))
+        shift = rows.mean - fitted.mean
+        offset = shift[self.n_features :] / self.target_scale - shift[: self.n_features] @ coefficients
+        return np.maximum(errors, 0.0) + rows.count * offset**2
 
     def _factor(self, total: Moments) -> np.ndarray:
         """Cholesky factor of the features' second moments S, in units of their standard deviations; takes the place of
@@ -368,10 +417,10 @@ def _residual(residual: np.ndarray, variance: np.ndarray) -> np.ndarray:
     return np.maximum(residual, SMALLEST_RESIDUAL * variance)
 
 
-def _affordable_features(expansion: BasisExpansion, inputs: np.ndarray, n_rows: float) -> np.ndarray:
-    """The richest features of which there are twice as many rows."""
+def _affordable_features(expansion: BasisExpansion, inputs: np.ndarray, n_rows: float) -> Iterator[np.ndarray]:
+    """Features of which there are twice as many rows, the richest first, and at last those that are linear."""
     for functions, products in ((4, True), (4, False), (2, False)):
         features = expansion.subset(inputs, functions, products)
         if n_rows >= 2 * len(features) + 2:
-            return features
-    return expansion.subset(inputs, 1, False)
+            yield features
+    yield expansion.subset(inputs, 1, False)
