@@ -109,9 +109,12 @@ class CausalGDP(AskedAlgorithm, DistilledAlgorithm, CheckedAlgorithm):
     :param sampler: ``ddpm``, ``ddim``, ``euler_maruyama``, ``heun`` or ``dpm_solver``
     :param ddim_eta: Noise of DDIM, from 0 (deterministic) to 1 (DDPM)
     :param n_action_candidates: Number of sampled actions from which a prediction takes the best, by the smallest of the
-        critics' Q
+        critics' Q, or see ``exploration_optimism``
     :param exploration_noise: Standard deviation of the Gaussian noise of non-deterministic predictions, for actions in
         [-1, 1]; a number or a function of the current progress remaining (from 1 to 0)
+    :param exploration_optimism: By what non-deterministic predictions judge candidates, in [-1, 1]: 1 for the largest of the
+        critics' Q, 0 for their mean, -1 for the smallest, by which deterministic ones always do. What the critics disagree
+        about is tried then (optimistic exploration, Ciosek et al., 2019, https://arxiv.org/abs/1910.12807)
     :param guidance: ``posterior`` (the gradient of log p(y | a^k), which accounts for the uncertainty of the clean action),
         ``score`` (the paper's plain gradient), ``normalized`` (unit length), or None
     :param guidance_target: What to aim for: ``return`` (one standard deviation of Q more than predicted) or ``reward`` (r*,
@@ -227,6 +230,7 @@ class CausalGDP(AskedAlgorithm, DistilledAlgorithm, CheckedAlgorithm):
         ddim_eta: float = 0.0,
         n_action_candidates: int = 10,
         exploration_noise: float | Schedule = 0.2,
+        exploration_optimism: float = 1.0,
         guidance: str | None = "posterior",
         guidance_target: str = "return",
         guidance_covariance: str = "unit_gaussian",
@@ -319,6 +323,7 @@ class CausalGDP(AskedAlgorithm, DistilledAlgorithm, CheckedAlgorithm):
         self.ddim_eta = ddim_eta
         self.n_action_candidates = n_action_candidates
         self.exploration_noise = exploration_noise
+        self.exploration_optimism = exploration_optimism
         self.guidance = guidance
         self.guidance_target = guidance_target
         self.guidance_covariance = guidance_covariance
@@ -393,7 +398,10 @@ class CausalGDP(AskedAlgorithm, DistilledAlgorithm, CheckedAlgorithm):
         self._check_together()
 
     def _own_policy_kwargs(self) -> dict[str, Any]:
-        own = {name: getattr(self, name) for name in ("n_action_candidates", *DIFFUSION_ARGUMENTS, *GUIDANCE_ARGUMENTS)}
+        own = {
+            name: getattr(self, name)
+            for name in ("n_action_candidates", "exploration_optimism", *DIFFUSION_ARGUMENTS, *GUIDANCE_ARGUMENTS)
+        }
         own["exploration_noise"] = FloatSchedule(self.exploration_noise)(1.0)
         networks = {"one_pass": self.actor_update == "trust_region", "value_network": self.expectile is not None}
         asked = {name: True for name, is_asked in networks.items() if is_asked}

@@ -149,9 +149,8 @@ class ExportedPolicy(nn.Module):
             noise = noise.unsqueeze(1).expand(-1, inputs[0].shape[0], -1, -1)
         else:
             noise = inputs[len(self.spaces)].transpose(0, 1)
-        actor = self.policy.acting_actor(self.deterministic)
-        features = actor.features(observation)
-        action = act_in_torch(self.policy, actor, observation, features, noise.flatten(1, 2), self.guided)
+        features = self.policy.acting_actor(self.deterministic).features(observation)
+        action = act_in_torch(self.policy, observation, features, noise.flatten(1, 2), self.deterministic, self.guided)
         if self.explores:
             action = (action + self.policy.exploration_noise * inputs[-1]).clamp(-1.0, 1.0)
         action = action.reshape(-1, *self.action_low.shape)

@@ -72,6 +72,19 @@ def smallest_q(critic: ContinuousCritic, features: th.Tensor, actions: th.Tensor
     return th.cat(q_values(critic, features, actions), dim=1).amin(dim=1, keepdim=True)
 
 
+def hoped_q(critic: ContinuousCritic, features: th.Tensor, actions: th.Tensor, optimism: float) -> th.Tensor:
+    """
+    :param critic: The critics
+    :param features: Shape ``(batch, features_dim)``
+    :param actions: In [-1, 1], shape ``(batch, d)``
+    :param optimism: -1 for the smallest of :func:`q_values`, 0 for their mean, 1 for the largest
+    :return: Shape ``(batch, 1)``
+    """
+    values = th.cat(q_values(critic, features, actions), dim=1)
+    extreme = values.amax(dim=1, keepdim=True) if optimism > 0.0 else values.amin(dim=1, keepdim=True)
+    return th.lerp(values.mean(dim=1, keepdim=True), extreme, abs(optimism))
+
+
 def _modelled(network: nn.Module, actions: th.Tensor) -> th.Tensor:
     """
     :param network: An actor or critics

@@ -84,6 +84,8 @@ class CausalGDPPolicy(AbstractingPolicy):
     :param outcome_guidance_scale: beta, scales the precision of the reward or return
     :param n_action_candidates: Number of candidates N from which prediction plays the best
     :param exploration_noise: Standard deviation of the Gaussian noise of stochastic predictions, for actions in [-1, 1]
+    :param exploration_optimism: What stochastic predictions hope of a candidate: -1 for the smallest Q of the critics, 0 for
+        their mean, 1 for the largest
     :param discount: Discount factor, for the return target
     :param one_pass: Whether an MLP trained alongside the denoiser does the acting: one pass, without candidates or guidance
         while acting
@@ -134,6 +136,7 @@ class CausalGDPPolicy(AbstractingPolicy):
         outcome_guidance_scale: float = 1.0,
         n_action_candidates: int = 10,
         exploration_noise: float = 0.2,
+        exploration_optimism: float = 1.0,
         discount: float = 0.99,
         one_pass: bool = False,
         value_network: bool = False,
@@ -172,6 +175,7 @@ class CausalGDPPolicy(AbstractingPolicy):
             "outcome_guidance_scale": outcome_guidance_scale,
             "n_action_candidates": n_action_candidates,
             "exploration_noise": exploration_noise,
+            "exploration_optimism": exploration_optimism,
             "discount": discount,
         }
         self.guidance_target = guidance_target
@@ -179,6 +183,7 @@ class CausalGDPPolicy(AbstractingPolicy):
         self.outcome_guidance_scale = outcome_guidance_scale
         self.n_action_candidates = n_action_candidates
         self.exploration_noise = exploration_noise
+        self.exploration_optimism = exploration_optimism
         self.discount = discount
 
         self.net_arch = [256, 256] if net_arch is None else net_arch
@@ -375,6 +380,13 @@ class CausalGDPPolicy(AbstractingPolicy):
             update to the next; the actor itself where it explores, and without ``use_ema``
         """
         return self.actor_target if deterministic and self.use_ema else self.actor
+
+    def acting_optimism(self, deterministic: bool) -> float:
+        """
+        :param deterministic: Whether it plays, and does not explore
+        :return: How the critics judge candidates, see :func:`~sb3_causalgdp.networks.hoped_q`
+        """
+        return -1.0 if deterministic else self.exploration_optimism
 
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         action = act(self, observation, deterministic)

@@ -10,7 +10,7 @@ from stable_baselines3.common.type_aliases import PyTorchObs
 
 from sb3_causalgdp.acceleration.acting import NumpyActing, OnePassActing
 from sb3_causalgdp.checks import first_not_finite_index, fits_float32
-from sb3_causalgdp.networks import DiffusionActor, smallest_q
+from sb3_causalgdp.networks import hoped_q
 
 Policy = Any  # a CausalGDPPolicy, whose file imports this one
 
@@ -31,21 +31,22 @@ def act(policy: Policy, observation: PyTorchObs, deterministic: bool) -> th.Tens
             "The policy cannot be traced or exported by PyTorch, which would take its actions for constants: "
             "use model.export('policy.onnx') or policy.export, also for .pt (TorchScript) and .pt2 (torch.export)"
         )
-    acting, plays = _numpy_acting(policy, observation), deterministic and policy.use_ema
+    acting = _numpy_acting(policy, observation)
     if isinstance(acting, OnePassActing):
         assert isinstance(observation, th.Tensor)
-        return th.from_numpy(acting(observation.float().flatten(1).numpy(), plays))
+        return th.from_numpy(acting(policy, observation.float().flatten(1).numpy(), deterministic))
     if acting is not None:
         assert isinstance(observation, th.Tensor)
         noise = candidate_noise(policy, len(observation), deterministic).cpu().numpy()
-        actions = acting(policy, observation.float().flatten(1).cpu().numpy(), noise, policy.is_guided, plays)
+        actions = acting(policy, observation.float().flatten(1).cpu().numpy(), noise, deterministic, policy.is_guided)
         return th.as_tensor(actions, device=observation.device)
     with th.no_grad():
         actor = policy.acting_actor(deterministic)
         features = actor.features(observation)
         if actor.one_pass is not None:
             return actor.sample(features)
-        return act_in_torch(policy, actor, observation, features, candidate_noise(policy, len(features), deterministic))
+        drawn = candidate_noise(policy, len(features), deterministic)
+        return act_in_torch(policy, observation, features, drawn, deterministic)
 
 
 def is_traced() -> bool:
@@ -71,24 +72,25 @@ def _numpy_acting(policy: Policy, observation: PyTorchObs) -> NumpyActing | OneP
 
 def act_in_torch(
     policy: Policy,
-    actor: DiffusionActor,
     observation: PyTorchObs,
     features: th.Tensor,
     noise: th.Tensor,
+    deterministic: bool,
     guided: bool | None = None,
 ) -> th.Tensor:
     """
     :param policy: The policy
-    :param actor: That of its actors that acts
     :param observation: Observations as SB3 gives them to policies
-    :param features: The actor's features of these
+    :param features: The features of these, by the actor that acts
     :param noise: Of the candidates, see :func:`candidate_noise`
+    :param deterministic: Whether it plays, and does not explore
     :param guided: Whether to steer, None for what the policy says now
     :return: Actions in [-1, 1], shape ``(batch, d)``
     """
+    actor = policy.acting_actor(deterministic)
     critic_features = policy.critic_target.extract_features(observation, policy.critic_target.features_extractor)
     candidates = actor.sample(features.repeat_interleave(policy.n_action_candidates, dim=0), noise)
-    best = _best_candidate(policy, critic_features, candidates)
+    best = _best_candidate(policy, critic_features, candidates, policy.acting_optimism(deterministic))
     action = candidates[best]
     if not (policy.is_guided if guided is None else guided):
         return action
@@ -125,14 +127,14 @@ def candidate_noise(policy: Policy, n_observations: int, deterministic: bool) ->
     return th.randn(n_steps, n_observations * n_candidates, action_dim, device=fixed.device)
 
 
-def _best_candidate(policy: Policy, critic_features: th.Tensor, actions: th.Tensor) -> th.Tensor:
-    """Row of the candidate with the largest of the smallest target Q, for each observation."""
+def _best_candidate(policy: Policy, critic_features: th.Tensor, actions: th.Tensor, optimism: float) -> th.Tensor:
+    """Row of the candidate with the largest target Q, as :func:`hoped_q` says it, for each observation."""
     n_candidates = policy.n_action_candidates
     first = th.arange(0, actions.shape[0], n_candidates, device=actions.device)
     if n_candidates == 1:
         return first
     repeated = critic_features.repeat_interleave(n_candidates, dim=0)
-    values = smallest_q(policy.critic_target, repeated, actions)
+    values = hoped_q(policy.critic_target, repeated, actions, optimism)
     return first + values.view(-1, n_candidates).argmax(dim=1)
 
 

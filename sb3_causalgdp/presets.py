@@ -58,6 +58,7 @@ _OF_DIFFUSION_QL: dict[str, Any] = {
     "target_policy_noise": 0.0,
     "bound_penalty": 0.0,
     "n_action_candidates": 50,
+    "exploration_optimism": -1.0,
     "policy_kwargs": {
         "net_arch": [256, 256, 256],
         "activation_fn": "mish",

@@ -12,6 +12,7 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
 
 from sb3_causalgdp import CausalGDP, CausalWorldModelCallback
+from sb3_causalgdp.networks import hoped_q, q_values
 
 KWARGS = {**SPREAD, "batch_size": 16, "gradient_steps": 2, "policy_delay": 1}
 
@@ -242,3 +243,25 @@ def test_what_reset_returns_is_not_an_observation():
         model.predict(gym.make("Pendulum-v1").reset())
     with pytest.raises(ValueError, match="Unexpected observation shape"):
         model.predict(np.zeros(7, dtype=np.float32))
+
+
+def test_exploration_hopes_and_playing_does_not(observations):
+    """What is hoped of an action decides which candidate is tried."""
+    model = train()
+    policy = model.policy
+    tensor = th.as_tensor(observations)
+    features = policy.critic.extract_features(tensor, policy.critic.features_extractor)
+    actions = 2.0 * th.rand(len(observations), 1) - 1.0
+    q = th.cat(q_values(policy.critic, features, actions), dim=1).detach()
+    for optimism, expected in ((1.0, q.amax(dim=1)), (0.0, q.mean(dim=1)), (-1.0, q.amin(dim=1))):
+        th.testing.assert_close(hoped_q(policy.critic, features, actions, optimism)[:, 0], expected)
+    halfway = hoped_q(policy.critic, features, actions, 0.5)[:, 0]
+    th.testing.assert_close(halfway, 0.5 * (q.mean(dim=1) + q.amax(dim=1)))
+
+    def predict(optimism, deterministic):
+        policy.exploration_optimism = optimism
+        th.manual_seed(0)
+        return policy.predict(np.tile(observations, (8, 1)), deterministic=deterministic)[0]
+
+    assert np.abs(predict(1.0, False) - predict(-1.0, False)).max() > 1e-3
+    np.testing.assert_array_equal(predict(1.0, True), predict(-1.0, True))

@@ -151,24 +151,25 @@ class NumpyActing(_Views):
             and (rule is None or not rule.needs_jacobian)
         )
 
-    def __call__(self, policy: Policy, state: np.ndarray, noise: np.ndarray, guided: bool, by_average: bool) -> np.ndarray:
+    def __call__(self, policy: Policy, state: np.ndarray, noise: np.ndarray, deterministic: bool, guided: bool) -> np.ndarray:
         """
         :param policy: The policy, for its settings
         :param state: The observations, float32, shape ``(batch, n)``
         :param noise: Noise of the candidates, shape ``(K, batch * n_action_candidates, d)``
+        :param deterministic: Whether it plays, and does not explore
         :param guided: Whether the guidance is on
-        :param by_average: Whether the actor's moving average acts
         :return: Actions in [-1, 1], shape ``(batch, d)``
         """
         if self._copy is not None:
             self._copy.refresh()
         # On products this small, several threads of numpy's library mostly wait for each other: ten times the time
         if all(library.num_threads == 1 for library in self._blas.lib_controllers):
-            return self._act(policy, state, noise, guided, self.denoisers[by_average])
+            return self._act(policy, state, noise, deterministic, guided)
         with self._blas.limit(limits=1):
-            return self._act(policy, state, noise, guided, self.denoisers[by_average])
+            return self._act(policy, state, noise, deterministic, guided)
 
-    def _act(self, policy: Policy, state: np.ndarray, noise: np.ndarray, guided: bool, denoiser: Denoiser) -> np.ndarray:
+    def _act(self, policy: Policy, state: np.ndarray, noise: np.ndarray, deterministic: bool, guided: bool) -> np.ndarray:
+        denoiser, optimism = self.denoisers[deterministic and policy.use_ema], policy.acting_optimism(deterministic)
         n_candidates = policy.n_action_candidates
         features = self.features(state.T)
         time_part = denoiser.time_part()
@@ -179,7 +180,7 @@ class NumpyActing(_Views):
         first_prediction = denoiser.predict(start, repeated[-1])
         action = denoiser.sample(repeated, start, scaled_noise, first_prediction).T
         if n_candidates > 1:
-            values = self.critics.values(features, action.T, n_candidates).reshape(-1, n_candidates)
+            values = self.critics.values(features, action.T, n_candidates, optimism).reshape(-1, n_candidates)
             best = np.arange(0, len(action), n_candidates) + values.argmax(axis=1)
             action, start, first_prediction = action[best], start[:, best], first_prediction[:, best]
             scaled_noise = scaled_noise[:, :, best]
@@ -263,13 +264,14 @@ class OnePassActing(_Views):
             and all(parameter.dtype == th.float32 for parameter in policy.actor.one_pass.parameters())
         )
 
-    def __call__(self, state: np.ndarray, by_average: bool) -> np.ndarray:
+    def __call__(self, policy: Policy, state: np.ndarray, deterministic: bool) -> np.ndarray:
         """
+        :param policy: The policy, for its settings
         :param state: The observations, float32, shape ``(batch, n)``
-        :param by_average: Whether the network's moving average acts
+        :param deterministic: Whether it plays, and does not explore
         :return: Actions in [-1, 1], shape ``(batch, d)``
         """
-        (weight, bias), *layers = self.layers[by_average]
+        (weight, bias), *layers = self.layers[deterministic and policy.use_ema]
         hidden = weight @ self.features(state.T)
         hidden += bias
         for weight, bias in layers:

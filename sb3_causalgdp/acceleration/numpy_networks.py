@@ -258,14 +258,19 @@ class _Critic:
 
 
 class Critics:
-    """The target critics: the smallest Q, and its gradient by the state."""
+    """The target critics: Q of candidates, and the gradient of the smallest by the state."""
 
     def __init__(self, policy: Policy) -> None:
         self.networks = [_Critic(network, policy.activation_fn) for network in policy.critic_target.q_networks]
 
-    def values(self, features: np.ndarray, actions: np.ndarray, n_candidates: int) -> np.ndarray:
-        """Smallest Q of several actions for each features."""
-        return reduce(np.minimum, (network.values(features, actions, n_candidates) for network in self.networks))[0]
+    def values(self, features: np.ndarray, actions: np.ndarray, n_candidates: int, optimism: float) -> np.ndarray:
+        """Q of several actions for each features, between the smallest, for -1, and the largest, for 1."""
+        values = [network.values(features, actions, n_candidates)[0] for network in self.networks]
+        extreme = reduce(np.maximum if optimism > 0.0 else np.minimum, values)
+        if abs(optimism) == 1.0:
+            return extreme
+        mean = sum(values) / np.float32(len(values))
+        return mean + np.float32(abs(optimism)) * (extreme - mean)
 
     def gradient(self, state: np.ndarray, action: np.ndarray) -> np.ndarray:
         """Of the smallest Q, by the state, shape ``(n, batch)``."""

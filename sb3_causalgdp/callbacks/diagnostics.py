@@ -71,16 +71,17 @@ def choice(policy: CausalGDPPolicy, observations: PyTorchObs) -> Choice:
     :param observations: A batch of observations
     :return: What the critics say of its actions; no random number is drawn
     """
-    features, critic = policy.actor.features(observations), policy.critic_target
+    actor, critic = policy.acting_actor(deterministic=True), policy.critic_target
+    features = actor.features(observations)
     n_candidates, n_observations = policy.n_action_candidates, len(features)
     noise = candidate_noise(policy, n_observations, deterministic=True)
-    candidates = policy.actor.sample(features.repeat_interleave(n_candidates, dim=0), noise)
+    candidates = actor.sample(features.repeat_interleave(n_candidates, dim=0), noise)
     critic_features = critic.extract_features(observations, critic.features_extractor)
     repeated = critic_features.repeat_interleave(n_candidates, dim=0)
     values = smallest_q(critic, repeated, candidates).view(-1, n_candidates)
     unguided = values.amax(dim=1).mean()
     spread = candidates.view(n_observations, n_candidates, -1).std(dim=1, correction=0).mean()
-    actions = act_in_torch(policy, policy.actor, observations, features, noise)
+    actions = act_in_torch(policy, observations, features, noise, deterministic=True)
     value = smallest_q(critic, critic_features, actions).mean()
     advantage = float(value - unguided) if policy.is_guided else 0.0
     return Choice(float(value), advantage, float(spread))

@@ -37,7 +37,12 @@ SelfAlgorithm = TypeVar("SelfAlgorithm", bound="SavedAlgorithm")
 
 
 # What models did before there were these arguments, and still do
-FIRST_VALUES: dict[str, Any] = {"target_policy_noise": 0.0, "pessimism": 1.0, "causal_abstraction": False}
+FIRST_VALUES: dict[str, Any] = {
+    "target_policy_noise": 0.0,
+    "pessimism": 1.0,
+    "causal_abstraction": False,
+    "exploration_optimism": -1.0,
+}
 
 
 class SavedAlgorithm(DiscoveringAlgorithm):

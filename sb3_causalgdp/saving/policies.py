@@ -26,6 +26,7 @@ _FIRST_DEFAULTS: dict[str, Any] = {
     "normalize_observations": False,
     "prediction_type": "noise",
     "use_ema": False,
+    "exploration_optimism": -1.0,
 }
 
 

@@ -56,7 +56,15 @@ def both_paths(policy, observations, deterministic=False):
         fast = act(policy, observations, deterministic)
         th.manual_seed(3)
         noise, actor = candidate_noise(policy, len(observations), deterministic), policy.acting_actor(deterministic)
-        return fast, act_in_torch(policy, actor, observations, actor.features(observations), noise)
+        return fast, act_in_torch(policy, observations, actor.features(observations), noise, deterministic)
+
+
+@pytest.mark.parametrize("optimism", [-1.0, -0.4, 0.0, 0.3, 1.0])
+@pytest.mark.parametrize("deterministic", [False, True])
+def test_both_paths_hope_for_the_same(optimism, deterministic):
+    policy = make_policy(exploration_optimism=optimism)
+    fast, plain = both_paths(policy, np.random.default_rng(0).normal(size=(8, N_STATES)).astype(np.float32), deterministic)
+    np.testing.assert_allclose(fast, plain, atol=2e-5)
 
 
 @pytest.mark.parametrize(("state_unit", "reward_unit"), [(1.0, 1e-9), (1e-6, 1.0), (0.0, 1.0), (1.0, 0.0)])
