@@ -98,8 +98,8 @@ class CausalGDP(AskedAlgorithm, DistilledAlgorithm, CheckedAlgorithm):
         many steps, the TD targets of all steps up to the next actor update are computed at once
     :param world_model_delay: The world model is updated once every this many gradient steps
     :param pessimism: How far TD targets go from the mean of the critics, 0, to the smallest of them, 1 (clipped double
-        Q-learning, as in TD3 and SAC). ``auto`` is 1 in :meth:`pretrain`; in ``learn()`` it begins at 0, or at 1 after
-        pretraining, and follows at each refresh of the graph: up if critics promise more than was obtained, else down
+        Q-learning, as in TD3 and SAC). ``auto`` begins at 0, or at 1 after pretraining, and follows at each refresh of the
+        graph: up if critics promise more than was obtained, else down. In :meth:`pretrain` it is always 1
     :param target_policy_noise: Standard deviation of the noise on the actions of TD targets, as in TD3
     :param target_noise_clip: Limit on its absolute value
     :param max_q_backup: Whether the TD target takes the best of ten sampled actions (Diffusion-QL, for AntMaze)
@@ -210,7 +210,7 @@ class CausalGDP(AskedAlgorithm, DistilledAlgorithm, CheckedAlgorithm):
         critic_learning_rate: float | Schedule | None = None,
         world_model_learning_rate: float | Schedule = 1e-3,
         eta: float = 1.0,
-        denoising_weight: float = 0.01,
+        denoising_weight: float = 0.001,
         actor_update: str = "one_step",
         q_scale: str = "value",
         expectile: float | None = None,
@@ -219,7 +219,7 @@ class CausalGDP(AskedAlgorithm, DistilledAlgorithm, CheckedAlgorithm):
         bound_penalty: float = 0.1,
         policy_delay: int = 3,
         world_model_delay: int = 2,
-        pessimism: float | str = 1.0,
+        pessimism: float | str = 0.5,
         target_policy_noise: float = 0.2,
         target_noise_clip: float = 0.5,
         max_q_backup: bool = False,
@@ -446,7 +446,6 @@ class CausalGDP(AskedAlgorithm, DistilledAlgorithm, CheckedAlgorithm):
             return
         self._trained_normalised = normalised_parts(self._vec_normalize_env)
         if self.is_pretraining:
-            # Nothing corrects critics that are too hopeful
             self.calibrated_pessimism = 1.0
         # Switch to train mode (this affects batch norm / dropout)
         self.policy.set_training_mode(True)

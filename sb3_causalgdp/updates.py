@@ -102,8 +102,9 @@ class Updates:
         of_methods = (model.expectile, model.advantage_temperature, model.improvement_step)
         rates = (model.tau, model.gamma, model.max_grad_norm, model.target_policy_noise, model.target_noise_clip)
         scales = (self.policy.state_guidance_scale, self.policy.outcome_guidance_scale, self.world_model.n_modelled)
-        is_auto = model.pessimism == "auto"
-        self.pessimism.fill_(model.calibrated_pessimism if is_auto else model.pessimism)
+        chosen = model.calibrated_pessimism if model.pessimism == "auto" else model.pessimism
+        # On a fixed dataset, nothing corrects critics that are too hopeful
+        self.pessimism.fill_(1.0 if model.is_pretraining else chosen)
         with n_threads_at_most(model.torch_threads, self.policy.has_image_state):
             yield self.fast.made_fast(gradient_steps, (weights, of_methods, rates, scales))
 

@@ -2,7 +2,7 @@
 What a policy of one pass keeps of the return of the policy that it is distilled from: the same seeds, without noise.
 
     python benchmarks/learning/distil.py Pendulum-v1 --steps 10000
-    python benchmarks/learning/distil.py HalfCheetah-v5 --checkpoint benchmarks/learning/checkpoints/HalfCheetah-v5_causalgdp_0
+    python benchmarks/learning/distil.py HalfCheetah-v5 --checkpoint benchmarks/learning/checkpoints/HalfCheetah-v5_previous_0
 
 A line of JSON for the teacher and for each student. "kept" is 1 where the student's return is the teacher's, 0 where it is
 that of uniform actions; "relative" is the difference in shares of the teacher's return.

@@ -528,8 +528,8 @@ DISTRACTION = {
         "causal/results/HalfCheetah-v5_sac_m100_k0": ("SAC", GREY),
     },
     "Ant-v5 (105 observations)": {
-        "learning/results/Ant-v5_causalgdp": ("CausalGDP, sees what matters", BLUE),
-        "learning/results/Ant-v5_causalgdp_sees_all": ("CausalGDP, sees everything", RED),
+        "learning/results/Ant-v5_previous": ("CausalGDP, sees what matters", BLUE),
+        "learning/results/Ant-v5_previous_sees_all": ("CausalGDP, sees everything", RED),
     },
 }
 

@@ -108,3 +108,14 @@ def test_pretraining_takes_the_smallest_and_what_was_calibrated_is_saved(tmp_pat
 def test_other_values_are_refused(value):
     with pytest.raises(ValueError, match="pessimism must be a number from 0 to 1 or 'auto'"):
         CausalGDP("MlpPolicy", Ones(), pessimism=value)
+
+
+def test_pretraining_takes_the_smallest_whatever_is_set_and_learning_what_is_set(tmp_path):
+    source = CausalGDP("MlpPolicy", Ones(), **SMALL).learn(40)
+    source.save_replay_buffer(tmp_path / "buffer")
+    model = CausalGDP("MlpPolicy", Ones(), pessimism=0.25, **SMALL)
+    model.preload(tmp_path / "buffer.npz")
+    model.pretrain(2)
+    assert model._updates.pessimism == 1.0
+    model.learn(40)
+    assert model._updates.pessimism == 0.25
