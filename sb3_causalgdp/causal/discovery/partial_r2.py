@@ -46,9 +46,9 @@ class PartialR2:
     that the world has changed: the rows before are forgotten (``causal.discovery.changes``).
 
     Linearly dependent variables are tested as a group and share its masks; variables that never move have no edges. Where rows
-    are few, the products are left out, then sine and tanh, then the square, so that there are two rows for each feature; and
-    where the residuals of most targets are three times as large in blocks that a fit has not seen, those of the simpler
-    features are taken that err least there.
+    are few, the products are left out, then sine and tanh, then the square, so that there are two rows for each feature. With
+    less than three, and residuals that are for most targets three times as large in blocks that a fit has not seen, those of
+    the simpler features are taken that err least there.
 
     :param threshold: Partial R^2 at which a mask is one half, in (0, 1)
     :param spread: Uncertainty of the mask in ln(partial R^2), beside that of the sample, positive

@@ -20,6 +20,7 @@ SMALLEST_RESIDUAL = 1e-9  # of the target's variance: what float32 rounding and 
 SMALLEST_DEVIATION = 1e-9  # in units of the standard deviation of all rows: below it, a column does not move in these rows
 THINNING = 8
 FOLDS = 4
+FEW_ROWS = 3.0  # for each feature
 MOST_OVERFITTING = 3.0  # of half of the targets: above, simpler features say more
 CHANGES_AT_ONCE = 2**18  # so that they stay in the processor's cache
 
@@ -125,7 +126,9 @@ class Regression:
 
         richest, *simpler = _affordable_features(expansion, degeneracy.kept, moments.count)
         factor = self._fit_by(richest, moments)
-        if simpler and np.median(self.overfitting) > MOST_OVERFITTING:
+        # Where rows are many, the world has changed among them, which simpler features explain no better
+        few = moments.count < FEW_ROWS * len(richest)
+        if simpler and few and np.median(self.overfitting) > MOST_OVERFITTING:
             factor = self._fit_by(min(simpler, key=lambda features: self._error_by(features, moments)), moments)
         self.raw_coefficients = self.fit.coefficients * th.from_numpy(self.inverse_scale)[:, None]
         self.penalty = self.ridge[:, None] * self.fit.coefficients.numpy()
