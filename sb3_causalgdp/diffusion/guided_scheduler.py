@@ -287,7 +287,8 @@ class GuidedScheduler:
         factor, actions = scale.expand(clean.shape[1:]), scale * clean + offset
         if self._is_about_one(clean.shape):
             factor, actions = factor[self.position], actions[:, self.position]
-        gradient, curvature = self.guidance(actions.flatten(1))
+        rows = actions.flatten(1)
+        gradient, curvature = _checked_answer(self.guidance(rows), tuple(rows.shape))
         factor = factor.flatten()
         return gradient * factor, curvature * factor[:, None] * factor
 
@@ -324,3 +325,15 @@ class GuidedScheduler:
 
         identity = th.eye(n_components, dtype=sample.dtype, device=sample.device)
         return th.func.vmap(column)(identity).permute(1, 2, 0)
+
+
+def _checked_answer(answer: Any, shape: tuple[int, ...]) -> tuple[th.Tensor, th.Tensor]:
+    """What a guidance of one's own says of actions of this shape."""
+    batch, width = shape
+    shapes = [tuple(part.shape) for part in answer] if isinstance(answer, tuple | list) else [tuple(answer.shape)]
+    if shapes != [(batch, width), (batch, width, width)]:
+        raise ValueError(
+            f"guidance must give a gradient and a curvature of the shapes {(batch, width)} and {(batch, width, width)} for "
+            f"actions of the shape {shape}, got {', '.join(map(str, shapes))}"
+        )
+    return answer[0], answer[1]

@@ -286,3 +286,12 @@ def test_cost_of_guidance_is_less_than_a_small_network():
 def test_arguments_of_another_kind_are_refused_at_construction(kwargs, message):
     with pytest.raises(TypeError, match=message):
         GuidedScheduler(**{"scheduler": diffusers.DDIMScheduler(), **kwargs})
+
+
+@pytest.mark.parametrize("answer", [lambda a: a, lambda a: (a, a), lambda a: (a[:, :1], a[:, :, None] * a[:, None])])
+def test_a_guidance_that_answers_otherwise_is_told_what_is_wanted(answer):
+    scheduler = GuidedScheduler(diffusers.DDIMScheduler(), answer)
+    scheduler.set_timesteps(4)
+    sample = th.randn(5, 2)
+    with pytest.raises(ValueError, match=r"a gradient and a curvature of the shapes \(5, 2\) and \(5, 2, 2\)"):
+        scheduler.step(th.zeros(5, 2), scheduler.timesteps[0], sample)
