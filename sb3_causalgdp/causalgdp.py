@@ -37,7 +37,7 @@ from sb3_causalgdp.offline.preload import normalised_parts
 from sb3_causalgdp.offline.pretraining import callback_list
 from sb3_causalgdp.policies import CausalGDPPolicy, CnnPolicy, DiffusionActor, MlpPolicy, MultiInputPolicy
 from sb3_causalgdp.questions import AskedAlgorithm
-from sb3_causalgdp.saving.policies import with_first_defaults
+from sb3_causalgdp.saving.policies import FIRST_ACTING, with_first_defaults
 from sb3_causalgdp.step_plans import StepPlan, dealt
 from sb3_causalgdp.updates import Losses, Updates, optimizer_of
 
@@ -298,7 +298,7 @@ class CausalGDP(AskedAlgorithm, DistilledAlgorithm, CheckedAlgorithm):
             offline_fraction=offline_fraction,
             reward_transform=reward_transform,
         )
-        self._has_first_defaults = False
+        self._has_first_defaults = self._has_first_acting = False
         self.critic_learning_rate = critic_learning_rate
         self.world_model_learning_rate = world_model_learning_rate
         self.eta = eta
@@ -352,6 +352,8 @@ class CausalGDP(AskedAlgorithm, DistilledAlgorithm, CheckedAlgorithm):
     def _setup_model(self) -> None:
         if self._has_first_defaults:
             self.policy_kwargs = with_first_defaults(self.policy_kwargs)
+        if self._has_first_acting:
+            self.policy_kwargs = {**FIRST_ACTING, **self.policy_kwargs}
         self._check_arguments()
         policy_kwargs = self.policy_kwargs
         # The policy gets our arguments too, but they must not enter the user's own dictionary

@@ -35,7 +35,8 @@ def distil(
         (DAgger, Ross et al., 2011, https://arxiv.org/abs/1011.0686)
     :return: A copy of the policy that acts by this perceptron
     """
-    one_pass = {"one_pass": True, "causal_abstraction": False}
+    # Features are those of the network that is trained
+    one_pass = {"one_pass": True, "causal_abstraction": False, "use_ema": False}
     student = type(teacher)(**{**teacher._get_constructor_parameters(), **one_pass}).to(teacher.device)
     # Without the gates, what is hidden from the teacher is not shown again
     own = {name: value for name, value in teacher.state_dict().items() if name not in ("state_gate", "action_gate")}

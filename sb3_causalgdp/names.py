@@ -110,12 +110,14 @@ def _of_one(env: gym.Env | None) -> tuple[Names | None, Names | None]:
     if env is None:
         return None, None
     states, actions = (_names_in(env, attribute) for attribute in ("state_names", "action_names"))
-    states, actions = states or _with_added(env, "state_names"), actions or _with_added(env, "action_names")
-    if states is None:
+    told = states is not None, actions is not None
+    states = _checked(states, env.observation_space) or _with_added(env, "state_names")
+    actions = _checked(actions, env.action_space) or _with_added(env, "action_names")
+    if states is None and not told[0]:
         states = _names_of_keys(env)
-    if states is None and not _is_changed(env, "state_names"):
+    if states is None and not told[0] and not _is_changed(env, "state_names"):
         states = _state_names(env.unwrapped)
-    if actions is None and not _is_changed(env, "action_names"):
+    if actions is None and not told[1] and not _is_changed(env, "action_names"):
         actions = _action_names(env.unwrapped)
     return _checked(states, env.observation_space), _checked(actions, env.action_space)
 
@@ -131,11 +133,20 @@ def _with_added(env: gym.Env, attribute: str) -> Names | None:
         added = getattr(env, f"added_{attribute}", ())
         if added:
             below = _of_one(env.env)[attribute == "action_names"]
-            return None if below is None else (*below, *added)
+            return None if below is None else _different((*below, *added))
         if getattr(env, space) != getattr(env.env, space) and not _keeps_numbers(env):
             return None
         env = env.env
     return None
+
+
+def _different(names: Names) -> Names:
+    """Two wrappers of one kind append the same names."""
+    found: list[str] = []
+    for name in names:
+        n_before = sum(one == name or one.startswith(f"{name} #") for one in found)
+        found.append(f"{name} #{n_before + 1}" if n_before else name)
+    return tuple(found)
 
 
 def _as_names(value: Any) -> Names | None:

@@ -31,6 +31,7 @@ METHODS: dict[str, dict[str, Any]] = {
     # Chen et al., 2024, https://arxiv.org/abs/2405.19690: a deterministic policy, whose entropy term is 0 (table 4)
     "dtql": {
         "actor_update": "trust_region",
+        "denoising_weight": 0.01,
         "expectile": 0.7,
         "policy_kwargs": {"critic_normalization": "layer"},
     },

@@ -122,7 +122,7 @@ class AskedAlgorithm(OfflineToOnlineAlgorithm):
 
     def _by_name(self, values: Mapping[str, Any]) -> dict[str, Any]:
         """What has the index of a variable gets its name."""
-        if not isinstance(values, Mapping):
+        if not hasattr(values, "items"):
             like = f"{{{self.transition_variables.action_names[0]!r}: 1.0}}"
             raise ValueError(f"values must be given by name, like {like}, got {values!r}")
         names = dict(zip(self._indices.names, self.transition_variables.names, strict=True))
@@ -131,6 +131,10 @@ class AskedAlgorithm(OfflineToOnlineAlgorithm):
         }
 
     def _states_of(self, observation: Any) -> np.ndarray:
+        if is_frame(observation) and not (
+            isinstance(self.observation_space, spaces.Box) and len(self.observation_space.shape) == 1
+        ):
+            raise ValueError(f"a table of observations needs a Box of one dimension, got {self.observation_space}")
         rows = _by_column("observation", observation, self.transition_variables.state_names)
         return states_of(self.policy, rows, self._vec_normalize_env)
 

@@ -268,3 +268,12 @@ def test_what_a_stress_wrapper_appends_has_a_name_and_the_rest_keeps_its_own():
     below = gym.wrappers.TransformObservation(gym.make("Pendulum-v1"), lambda obs: obs[:2], spaces.Box(-1.0, 1.0, (2,)))
     assert found_names(stress.NoiseDistractors(below, n=1))[0] is None
     assert CausalGDP("MlpPolicy", env, buffer_size=10).transition_variables.state_names == names[0]
+
+
+def test_what_is_appended_to_an_environment_with_names_of_its_own_keeps_both():
+    class Named(gym.Wrapper):
+        state_names, action_names = ("x", "y", "turn"), ("push",)
+
+    named = Named(gym.make("Pendulum-v1"))
+    env = stress.IdleActions(stress.NoiseDistractors(stress.NoiseDistractors(named, n=2), n=1), n=1)
+    assert found_names(env) == (("x", "y", "turn", "noise 1", "noise 2", "noise 1 #2"), ("push", "idle 1"))

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch as th
 from small_models import small
+from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_causalgdp import CausalGDP, MlpPolicy, preset
@@ -171,6 +172,29 @@ def test_the_one_pass_policy_asks_the_denoiser_nothing_and_survives_saving(tmp_p
 
 
 # Distillation -----------------------------------------------------------------------------------------------------------
+
+
+class Stretched(FlattenExtractor):
+    """Features that are learned."""
+
+    def __init__(self, observation_space):
+        super().__init__(observation_space)
+        self.layer = th.nn.Linear(self.features_dim, self.features_dim)
+
+    def forward(self, observations):
+        return self.layer(super().forward(observations))
+
+
+def test_a_student_sees_what_it_was_taught_on():
+    extractor = {"features_extractor_class": Stretched}
+    model = CausalGDP("MlpPolicy", "Pendulum-v1", **small(extractor, **{**KWARGS, "tau": 1e-3, "learning_rate": 1e-2})).learn(
+        300
+    )
+    student = model.distil(n_observations=300, gradient_steps=300, batch_size=32)
+    observations = np.random.default_rng(0).normal(size=(50, 3)).astype(np.float32)
+    with th.no_grad():
+        expected = student.actor.one_pass(student.actor.features(th.as_tensor(observations))).numpy()
+    np.testing.assert_allclose(student.predict(observations, deterministic=True)[0], 2.0 * expected, atol=1e-5)
 
 
 @pytest.fixture(scope="module")

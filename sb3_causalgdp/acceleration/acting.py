@@ -169,7 +169,7 @@ class NumpyActing(_Views):
             return self._act(policy, state, noise, deterministic, guided)
 
     def _act(self, policy: Policy, state: np.ndarray, noise: np.ndarray, deterministic: bool, guided: bool) -> np.ndarray:
-        denoiser, optimism = self.denoisers[deterministic and policy.use_ema], policy.acting_optimism(deterministic)
+        denoiser, optimism = self.denoisers[bool(deterministic and policy.use_ema)], policy.acting_optimism(deterministic)
         n_candidates = policy.n_action_candidates
         features = self.features(state.T)
         time_part = denoiser.time_part()
@@ -271,7 +271,7 @@ class OnePassActing(_Views):
         :param deterministic: Whether it plays, and does not explore
         :return: Actions in [-1, 1], shape ``(batch, d)``
         """
-        (weight, bias), *layers = self.layers[deterministic and policy.use_ema]
+        (weight, bias), *layers = self.layers[bool(deterministic and policy.use_ema)]
         hidden = weight @ self.features(state.T)
         hidden += bias
         for weight, bias in layers:

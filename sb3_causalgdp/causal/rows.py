@@ -42,6 +42,8 @@ def as_array(tensor: th.Tensor) -> np.ndarray:
 def as_numbers(name: str, values: npt.ArrayLike) -> np.ndarray:
     """A copy in double precision, of what is no text that looks like numbers."""
     array = np.asarray(values)
+    if array.dtype == object and not any(isinstance(value, str | bytes) for value in array.flat):
+        array = array.astype(np.float64)
     if array.dtype.kind not in "biuf":
         raise ValueError(f"{name} must be numbers, got {' '.join(repr(values).split())[:100]}")
     return array.astype(np.float64)

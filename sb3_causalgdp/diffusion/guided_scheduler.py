@@ -1,6 +1,7 @@
 """Guidance for a policy whose sampler is a scheduler of ``diffusers``, such as those of LeRobot and ``diffusion_policy``."""
 
 from collections.abc import Callable
+from numbers import Integral
 from typing import Any, NamedTuple
 
 import torch as th
@@ -143,7 +144,7 @@ class GuidedScheduler:
             raise TypeError(f"scheduler must be an object of diffusers, like DDIMScheduler(), got {scheduler!r}")
         if guidance is not None and not callable(guidance):
             raise TypeError(f"guidance must be a function of actions or None, got {guidance!r}")
-        if position is not None and (isinstance(position, bool) or not isinstance(position, int)):
+        if position is not None and (isinstance(position, bool) or not isinstance(position, Integral)):
             raise TypeError(f"position must be an integer or None, got {position!r}")
         self.scheduler = scheduler
         self.guidance = guidance

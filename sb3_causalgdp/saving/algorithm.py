@@ -17,7 +17,7 @@ from stable_baselines3.common.save_util import open_path, recursive_getattr
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_causalgdp.arguments import CONSTRUCTOR_ARGUMENTS, check_arguments
+from sb3_causalgdp.arguments import CONSTRUCTOR_ARGUMENTS, POLICY_ARGUMENTS, check_arguments
 from sb3_causalgdp.checkpoints import TrainingCheckpointCallback, resume, save_checkpoint
 from sb3_causalgdp.checkpoints.callback_states import all_callbacks
 from sb3_causalgdp.checkpoints.checkpoint import bookkeeping_of
@@ -129,7 +129,7 @@ class SavedAlgorithm(DiscoveringAlgorithm):
         :raises ImportError: If a package for ONNX is missing
         :raises RuntimeError: If the file gives other actions than ``predict``
         """
-        if self._n_updates == 0:
+        if self._n_updates == 0 and self.world_model.n_batches == 0:
             warnings.warn("The model has not been trained: what is exported is the policy that it started with.")
         normalizer = self._vec_normalize_env if isinstance(vec_normalize, str) else vec_normalize
         export_policy(self.policy, path, self.transition_variables, guided, deterministic, normalizer)
@@ -213,6 +213,8 @@ class SavedAlgorithm(DiscoveringAlgorithm):
                 more |= {name: value for name, value in FIRST_VALUES.items() if name not in saved.named}
                 if "target_policy_noise" not in saved.named:
                     more["_has_first_defaults"] = True
+                if "exploration_optimism" not in saved.named:
+                    more["_has_first_acting"] = True
                 model = super().load(
                     file,
                     env,
@@ -346,8 +348,10 @@ class SavedAlgorithm(DiscoveringAlgorithm):
 
 def _check_known(kwargs: Iterable[str], named: Collection[str]) -> None:
     """A misspelt argument would become an attribute that nothing reads."""
-    known = {*CONSTRUCTOR_ARGUMENTS, *named}
+    known = {*CONSTRUCTOR_ARGUMENTS, *named, *LARGE}
     for name in kwargs:
+        if name in POLICY_ARGUMENTS and name not in known:
+            raise TypeError(f"load() got {name!r}, an argument of the policy: those are chosen when the model is made")
         if name not in known:
             close = difflib.get_close_matches(name, known, n=1)
             hint = f", did you mean {close[0]!r}?" if close else ""

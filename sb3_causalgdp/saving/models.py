@@ -144,6 +144,8 @@ def read_values(file: BinaryIO, known: Known, given: Collection[str], trusted: b
         if not trusted:
             _check_tensors(archive, entries)
         saved = read_json(archive.read("data")) if "data" in archive.namelist() else None
+        if "manifest.json" in archive.namelist():
+            raise ValueError("it is a checkpoint of a training, with which resume() goes on")
         if not isinstance(saved, dict):
             raise ValueError("it holds no attributes of a model: a policy that was saved alone is loaded by MlpPolicy.load")
         _check_algorithm(saved)

@@ -25,9 +25,9 @@ _FIRST_DEFAULTS: dict[str, Any] = {
     "critic_normalization": None,
     "normalize_observations": False,
     "prediction_type": "noise",
-    "use_ema": False,
-    "exploration_optimism": -1.0,
 }
+# Of all policies before there were these arguments
+FIRST_ACTING: dict[str, Any] = {"use_ema": False, "exploration_optimism": -1.0}
 
 
 def with_first_defaults(arguments: dict[str, Any]) -> dict[str, Any]:
@@ -154,6 +154,7 @@ def _read_policy(
     arguments = {**saved["data"], **arguments}
     if "critic_normalization" not in arguments:
         arguments = with_first_defaults(arguments)
+    arguments = {**FIRST_ACTING, **arguments}
     if not trusted:
         check_limits(arguments, size_of(file))
     # Schedules are not needed for predictions

@@ -102,19 +102,20 @@ def _read_frame(path: Path, suffix: str) -> Any:
     except ImportError as error:
         raise ImportError(f"pandas is needed to read {path.name}: pip install pandas") from error
     if suffix in SEPARATORS:
-        return _checked_separator(pd.read_csv(path, sep=SEPARATORS[suffix]), SEPARATORS[suffix])
+        _check_separator(path, SEPARATORS[suffix])
+        return pd.read_csv(path, sep=SEPARATORS[suffix])
     try:
         return pd.read_parquet(path)
     except ImportError as error:
         raise ImportError(f"pyarrow is needed to read {path.name}: pip install pyarrow") from error
 
 
-def _checked_separator(frame: Any, separator: str) -> Any:
-    first = str(frame.columns[0])
-    other = next((sign for sign in (";", "\t", ",", "|") if sign in first), None)
-    if len(frame.columns) == 1 and other is not None:
+def _check_separator(path: Path, separator: str) -> None:
+    with path.open(encoding="utf-8", errors="replace") as file:
+        names, first = file.readline(), file.readline()
+    other = next((sign for sign in (";", "\t", ",", "|") if sign in names and sign in first), None)
+    if separator not in names and other is not None:
         raise ValueError(
             f"its values are separated by {other!r}, not by {separator!r}: write it anew with {separator!r}, or in "
             f"Python give pandas.read_csv(path, sep={other!r}), with decimal=',' where numbers have commas"
         )
-    return frame

@@ -11,6 +11,7 @@ from sb3_causalgdp.sources.columns import columns_of
 
 MOST_CATEGORIES = 50
 SHOWN = 5  # rows and names in messages
+FEW_LEVELS = 10  # so many numbers and words may be the names of modes
 MISTAKES = 0.1  # with a smaller share of words among its numbers, a column is no text
 GAP = 1.5  # times the median step between two rows: there, recording paused
 MISSING = ("raise", "drop")
@@ -209,8 +210,9 @@ def _as_numbers(table: str, name: str, values: np.ndarray) -> tuple[np.ndarray, 
 def _check_mostly_text(table: str, name: str, values: np.ndarray) -> None:
     """A few words among numbers are mistakes, no categories."""
     wrong = [(row, value) for row, value in enumerate(values) if value is not None and not _is_number(value)]
-    n_present = sum(value is not None for value in values)
-    if 0 < len(wrong) < MISTAKES * n_present:
+    present = [value for value in values if value is not None]
+    n_levels = len({str(value) for value in present})
+    if n_levels > FEW_LEVELS and 0 < len(wrong) < MISTAKES * len(present):
         listed = ", ".join(f"{value!r} in row {row}" for row, value in wrong[:SHOWN])
         more = f" and {len(wrong) - SHOWN} more" if len(wrong) > SHOWN else ""
         raise ValueError(
@@ -222,7 +224,7 @@ def _check_mostly_text(table: str, name: str, values: np.ndarray) -> None:
 def _is_number(value: Any) -> bool:
     try:
         float(value)
-    except ValueError:
+    except (TypeError, ValueError):
         return False
     return True
 

@@ -10,7 +10,7 @@ from sb3_causalgdp.causal import StreamingMoments, TransitionVariables, make_dis
 from sb3_causalgdp.causal.discovery import DISCOVERY_METHODS, PartialR2, discover, make_statistics, partial_r2
 from sb3_causalgdp.causal.discovery import regression as regressions
 from sb3_causalgdp.causal.discovery.evidence import edge_probability
-from sb3_causalgdp.causal.statistics.basis import BasisMoments
+from sb3_causalgdp.causal.statistics.basis import BasisMoments, bytes_needed
 from sb3_causalgdp.causal.statistics.jackknife import jackknife_error
 from sb3_causalgdp.stress import NoiseDistractors
 
@@ -649,3 +649,22 @@ def test_where_rich_features_only_follow_the_rows_simpler_ones_are_taken():
     assert (np.diag(masks) > 0.9).all()
     others = masks[:, :8][~np.eye(8, dtype=bool)]
     assert (others > 0.5).mean() < 0.1
+    # Columns that never move say nothing about the others
+    still = np.column_stack([rows[:, :8], np.ones((200, 9)), rows[:, 8:17], np.ones((200, 9)), rows[:, 17:]])
+    more = TransitionVariables(tuple(f"s{i}" for i in range(17)), ("a",))
+    with_still = discover("partial_r2", still, more).masks[:8, :8][~np.eye(8, dtype=bool)]
+    assert (with_still > 0.5).mean() < 0.1
+
+
+def test_blocks_of_unequal_size_are_no_overfitting():
+    """A long block and a short one, as in a memory for few of them."""
+    rng = np.random.default_rng(0)
+    states, actions = rng.normal(size=(1_032, 3)), rng.normal(size=(1_032, 2))
+    following = 0.5 * states + 0.1 * rng.normal(size=states.shape)
+    method = make_discovery("partial_r2", max_memory=4 * bytes_needed(3, 5, "products"))
+    statistics = make_statistics(method, VARIABLES)
+    for batch in (slice(0, 1_024), slice(1_024, 1_032)):
+        part = (values[batch] for values in (states, actions, following, following[:, 0]))
+        statistics.update(VARIABLES.stack(*part))
+    graph = method(statistics, VARIABLES)
+    assert (np.diag(graph.evidence[:3, :3]) > 0.99).all() and graph.detectable_r2.max() < 0.05

@@ -566,4 +566,27 @@ def test_a_file_of_another_kind_is_told_apart(model, saved, tmp_path):
 def test_a_misspelt_argument_of_load_is_refused(saved):
     with pytest.raises(TypeError, match=r"unexpected keyword argument 'guidance_scal', did you mean 'guidance_scale'\?"):
         CausalGDP.load(saved, guidance_scal=0.5)
-    assert CausalGDP.load(saved, num_timesteps=3, guidance_scale=0.5).num_timesteps == 3
+    with pytest.raises(TypeError, match="load\\(\\) got 'use_ema', an argument of the policy"):
+        CausalGDP.load(saved, use_ema=False)
+    assert CausalGDP.load(saved, num_timesteps=3, guidance_scale=0.5, causal_graph_history=[]).num_timesteps == 3
+
+
+def test_a_policy_without_newer_arguments_acts_as_it_did(model, tmp_path):
+    model.policy.save(tmp_path / "policy.zip")
+    saved = th.load(tmp_path / "policy.zip", weights_only=True)
+    content = json.loads(saved["plain.json"])
+    for name in ("use_ema", "exploration_optimism"):
+        content["attributes"].pop(name, None)
+        saved["data"].pop(name, None)
+    th.save({**saved, "plain.json": json.dumps(content)}, tmp_path / "older.zip")
+    policy = MlpPolicy.load(tmp_path / "older.zip")
+    assert policy.use_ema is False and policy.exploration_optimism == -1.0
+
+
+def test_a_model_without_newer_arguments_acts_as_it_did(saved, tmp_path):
+    older = changed(
+        saved, tmp_path / "older.zip", data=lambda data: {k: v for k, v in data.items() if k != "exploration_optimism"}
+    )
+    policy = CausalGDP.load(older).policy
+    assert policy.use_ema is False and policy.exploration_optimism == -1.0
+    assert CausalGDP.load(saved).policy.use_ema is True

@@ -207,3 +207,21 @@ def test_another_separator_is_named(tmp_path, suffix, separator):
     make_frame().to_csv(path, index=False, sep=separator)
     with pytest.raises(ValueError, match=f"its values are separated by {separator!r}".replace("\\", "\\\\")):
         Table(path, **ROLES)
+
+
+def test_a_rare_mode_among_digits_is_a_mode():
+    frame = make_frame()
+    frame["mode"] = np.where(np.arange(len(frame)) % 25 == 0, "X", (np.arange(len(frame)) % 3).astype(str))
+    assert "mode=X" in Table(frame, **{**ROLES, "states": ["level", "mode"]}).state_names
+
+
+def test_values_that_are_neither_text_nor_numbers_are_categories():
+    frame = make_frame()
+    frame["band"] = pd.cut(frame["level"], 3)
+    assert len(Table(frame, **{**ROLES, "states": ["level", "band"]}).state_names) == 3
+
+
+def test_a_name_with_another_separator_is_a_name(tmp_path):
+    frame = make_frame().rename(columns={"level": "level, m"})
+    frame.to_csv(tmp_path / "tank.csv", index=False)
+    assert Table(tmp_path / "tank.csv", **{**ROLES, "states": ["level, m"]}).state_names == ("level, m",)

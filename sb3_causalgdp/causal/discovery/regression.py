@@ -20,6 +20,7 @@ SMALLEST_RESIDUAL = 1e-9  # of the target's variance: what float32 rounding and 
 SMALLEST_DEVIATION = 1e-9  # in units of the standard deviation of all rows: below it, a column does not move in these rows
 THINNING = 8
 FOLDS = 4
+LEAST_FREEDOM = 0.25  # for each feature, of a fit that is asked about rows that it has not seen
 FEW_ROWS = 3.0  # for each feature
 MOST_OVERFITTING = 3.0  # of half of the targets: above, simpler features say more
 CHANGES_AT_ONCE = 2**18  # so that they stay in the processor's cache
@@ -128,7 +129,8 @@ class Regression:
         factor = self._fit_by(richest, moments)
         # Where rows are many, the world has changed among them, which simpler features explain no better
         few = moments.count < FEW_ROWS * len(richest)
-        if simpler and few and np.median(self.overfitting) > MOST_OVERFITTING:
+        moving = self.overfitting[self.target_moves]
+        if simpler and few and len(moving) > 0 and np.median(moving) > MOST_OVERFITTING:
             factor = self._fit_by(min(simpler, key=lambda features: self._error_by(features, moments)), moments)
         self.raw_coefficients = self.fit.coefficients * th.from_numpy(self.inverse_scale)[:, None]
         self.penalty = self.ridge[:, None] * self.fit.coefficients.numpy()
@@ -159,8 +161,7 @@ class Regression:
         self.inverse_scale = moves / np.where(moves, deviation, 1.0)
         factor = self._factor(total)
         self.fit = self._fit(total, factor)
-        self.unseen_residual = self._unseen_residual()
-        self.overfitting = self._overfitting()
+        self._look_at_unseen()
         return factor
 
     def r_squared(self) -> np.ndarray:
@@ -222,28 +223,28 @@ class Regression:
         independent = n_moving * residual * self.total.count * float(np.sum(shares * (1.0 - shares)))
         return np.maximum(np.einsum("ijk,ijk->k", scores, scores) / independent, 1.0)
 
-    def _unseen_residual(self) -> np.ndarray:
-        """Mean square of the residuals in rows that a fit has not seen, shape (m,)."""
-        n_folds = min(FOLDS, len(self.blocks))
-        if n_folds < 2:
-            return self.fit.residual
-        errors = np.zeros(self.shape[1])
-        for i in range(n_folds):
-            # From everywhere in the recording, so that no time of it is unseen
-            fold = merge(self.blocks[i::n_folds])
-            rest = merge([block for j, block in enumerate(self.blocks) if j % n_folds != i])
-            errors += self._squared_errors(self._fit(rest, self._factor(rest)), fold, rest)
-        return errors / self.total.count
-
-    def _overfitting(self) -> np.ndarray:
+    def _look_at_unseen(self) -> None:
         """
-        The same in units of what independent rows would give, at least 1, shape (m,). Many slow features follow the slow
-        errors of a model that is not quite right, and are no causes of them.
+        The mean square of the residuals in rows that a fit has not seen, and that in units of what independent rows would
+        give, at least 1, each of shape (m,). Many slow features follow the slow errors of a model that is not quite right, and
+        are no causes of them.
         """
+        self.unseen_residual, self.overfitting = self.fit.residual, np.ones(self.shape[1])
         n_used, n_folds = int(self.used.sum()), min(FOLDS, len(self.blocks))
-        freedom = max(self.total.count * (n_folds - 1) / n_folds - n_used - 1.0, 1.0)
-        independent = self.fit.residual * self.total.count / self.freedom * (1.0 + n_used / freedom)
-        return np.maximum(self.unseen_residual / independent, 1.0)
+        errors, n_unseen, expected = np.zeros(self.shape[1]), 0.0, 0.0
+        for i in range(n_folds if n_folds > 1 else 0):
+            # From everywhere in the recording, so that no time of it is unseen
+            rest = merge([block for j, block in enumerate(self.blocks) if j % n_folds != i])
+            freedom = rest.count - n_used - 1.0
+            if freedom < LEAST_FREEDOM * n_used:
+                continue
+            fold = merge(self.blocks[i::n_folds])
+            errors += self._squared_errors(self._fit(rest, self._factor(rest)), fold, rest)
+            n_unseen += fold.count
+            expected += fold.count * (1.0 + n_used / freedom)
+        if n_unseen > 0.0:
+            noise = self.fit.residual * self.total.count / self.freedom
+            self.unseen_residual, self.overfitting = errors / n_unseen, np.maximum(errors / (expected * noise), 1.0)
 
     def _squared_errors(self, fit: Fit, rows: Moments, fitted: Moments) -> np.ndarray:
         """Of a fit to other rows, their sum, in units of the targets' deviations in all rows, shape (m,)."""
@@ -422,8 +423,12 @@ def _residual(residual: np.ndarray, variance: np.ndarray) -> np.ndarray:
 
 def _affordable_features(expansion: BasisExpansion, inputs: np.ndarray, n_rows: float) -> Iterator[np.ndarray]:
     """Features of which there are twice as many rows, the richest first, and at last those that are linear."""
+    richer = 0
     for functions, products in ((4, True), (4, False), (2, False)):
         features = expansion.subset(inputs, functions, products)
-        if n_rows >= 2 * len(features) + 2:
+        if len(features) != richer and n_rows >= 2 * len(features) + 2:
             yield features
-    yield expansion.subset(inputs, 1, False)
+        richer = len(features)
+    linear = expansion.subset(inputs, 1, False)
+    if len(linear) != richer or n_rows < 2 * len(linear) + 2:
+        yield linear
