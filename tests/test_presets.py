@@ -186,10 +186,9 @@ class Stretched(FlattenExtractor):
 
 
 def test_a_student_sees_what_it_was_taught_on():
-    extractor = {"features_extractor_class": Stretched}
-    model = CausalGDP("MlpPolicy", "Pendulum-v1", **small(extractor, **{**KWARGS, "tau": 1e-3, "learning_rate": 1e-2})).learn(
-        300
-    )
+    policy_kwargs = {**KWARGS["policy_kwargs"], "features_extractor_class": Stretched}
+    kwargs = {**KWARGS, "policy_kwargs": policy_kwargs, "tau": 1e-3, "learning_rate": 1e-2}
+    model = CausalGDP("MlpPolicy", "Pendulum-v1", **kwargs).learn(300)
     student = model.distil(n_observations=300, gradient_steps=300, batch_size=32)
     observations = np.random.default_rng(0).normal(size=(50, 3)).astype(np.float32)
     with th.no_grad():

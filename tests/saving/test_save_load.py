@@ -204,6 +204,7 @@ ARGUMENTS = {
     "improvement_step": 0.2,
     "bound_penalty": 0.2,
     "pessimism": 0.3,
+    "exploration_optimism": 0.4,
     "target_policy_noise": 0.15,
     "target_noise_clip": 0.4,
     "policy_delay": 4,
