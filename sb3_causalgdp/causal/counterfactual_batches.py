@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from sb3_causalgdp.causal.graph import CausalGraph
     from sb3_causalgdp.causal.world_model import MaskedWorldModel
 
-BINDING = 0.05  # an edge of at least this probability binds two variables together
+BINDING = 0.2  # an edge of at least this probability binds two variables together
 
 RewardModel = Callable[[th.Tensor, th.Tensor], th.Tensor]
 """From next states, shape (batch, n), and actions, shape (batch, d), to rewards, shape (batch,)."""

@@ -34,6 +34,8 @@ def trained(activation_fn="mish"):
     # What batch statistics make of a rounding grows with each update
     policy_kwargs["critic_normalization"] = "layer"
     arguments = {"causal_refresh_freq": 205, "learning_starts": 206, "batch_size": 32, "policy_kwargs": policy_kwargs}
+    # So that neither the actor nor the choice of a candidate follows a rounding of Q
+    arguments |= {"denoising_weight": 0.01, "pessimism": 1.0, "exploration_optimism": -1.0}
     # Random actions alone: a rounding in an action would change all that comes after it
     model = CausalGDP("MlpPolicy", "Pendulum-v1", seed=0, device="cpu", **arguments).learn(206)
     assert model.policy.is_guided

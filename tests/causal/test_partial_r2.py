@@ -20,7 +20,6 @@ sys.path.append(str(Path(__file__).parents[2]))
 from benchmarks.discovery.metrics import auroc, ece, f1
 from benchmarks.discovery.systems import KINDS, make_system
 
-
 VARIABLES = TransitionVariables(("x", "y", "z"), ("push", "pull"))
 NO_SPREAD = 1e-9  # masks are 0 or 1, but for the error of the sample
 
