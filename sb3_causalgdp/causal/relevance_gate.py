@@ -63,7 +63,7 @@ class RelevanceGate:
         low: float = 0.05,
         high: float = 0.5,
         patience: int = 2,
-        detectable: float = 0.05,
+        detectable: float = 0.03,
         known: float = 0.25,
         min_reward_r2: float = 0.1,
     ) -> None:
