@@ -31,7 +31,6 @@ METHODS: dict[str, dict[str, Any]] = {
     # Chen et al., 2024, https://arxiv.org/abs/2405.19690: a deterministic policy, whose entropy term is 0 (table 4)
     "dtql": {
         "actor_update": "trust_region",
-        "denoising_weight": 0.01,
         "expectile": 0.7,
         "policy_kwargs": {"critic_normalization": "layer"},
     },
@@ -78,6 +77,9 @@ OFFLINE: dict[str, dict[str, Any]] = {
     "qvpo": {**_OF_DIFFUSION_QL, "denoising_weight": 1.0},
 }
 
+# Where a default of CausalGDP's means something else in the method: here the weight of the trust region
+ONLINE: dict[str, dict[str, Any]] = {"dtql": {"denoising_weight": 0.01}}
+
 # Guided and not, they differ in the guidance alone
 NOT_ABSTRACTING: dict[str, Any] = {"causal_abstraction": False}
 NOT_GUIDED: dict[str, Any] = {"guidance": None}
@@ -102,11 +104,9 @@ def preset(name: str, offline: bool = False, guided: bool = False, **changes: An
         close = difflib.get_close_matches(str(name), PRESETS, n=1)
         hint = f", did you mean {close[0]!r}?" if close else ""
         raise ValueError(f"preset must be one of {list(PRESETS)}, got {name!r}{hint}")
-    parts: list[Mapping[str, Any]] = [METHODS[name], NOT_ABSTRACTING, {} if guided else NOT_GUIDED, changes]
-    if offline:
-        # What makes the method wins over the settings that it shares with others
-        parts.insert(0, OFFLINE[name])
-    return _joined(parts)
+    # What makes the method wins over the settings that it shares with others
+    settings = OFFLINE[name] if offline else ONLINE.get(name, {})
+    return _joined([settings, METHODS[name], NOT_ABSTRACTING, {} if guided else NOT_GUIDED, changes])
 
 
 def _joined(parts: list[Mapping[str, Any]]) -> dict[str, Any]:

@@ -174,6 +174,12 @@ def test_the_one_pass_policy_asks_the_denoiser_nothing_and_survives_saving(tmp_p
 # Distillation -----------------------------------------------------------------------------------------------------------
 
 
+def test_the_trust_region_has_the_papers_weight_on_a_fixed_dataset_and_a_smaller_one_online():
+    assert preset("dtql", offline=True)["denoising_weight"] == 5.0
+    assert preset("dtql")["denoising_weight"] == 0.01
+    assert preset("dtql", denoising_weight=2.0)["denoising_weight"] == 2.0
+
+
 class Stretched(FlattenExtractor):
     """Features that are learned."""
 
