@@ -42,13 +42,15 @@ def distil(
     own = {name: value for name, value in teacher.state_dict().items() if name not in ("state_gate", "action_gate")}
     student.load_state_dict(own, strict=False)
     student.set_training_mode(False)
+    network = student.actor.one_pass
     examples = _examples(teacher, student, observations)
-    _imitate(student, *examples, gradient_steps, batch_size, learning_rate)
+    _imitate(network, *examples, gradient_steps, batch_size, learning_rate)
     for _ in range(n_rounds if visit is not None else 0):
         assert visit is not None
         more = _examples(teacher, student, visit(student))
         examples = th.cat([examples[0], more[0]]), th.cat([examples[1], more[1]])
-        _imitate(student, *examples, max(1, gradient_steps // 2), batch_size, learning_rate)
+        _imitate(network, *examples, max(1, gradient_steps // 2), batch_size, learning_rate)
+    student.actor_target.one_pass.load_state_dict(network.state_dict())
     return student
 
 
@@ -64,9 +66,8 @@ def _examples(teacher: Policy, student: Policy, observations: Sequence[Any]) -> 
 
 
 def _imitate(
-    student: Policy, features: th.Tensor, actions: th.Tensor, gradient_steps: int, batch_size: int, learning_rate: float
+    network: th.nn.Module, features: th.Tensor, actions: th.Tensor, gradient_steps: int, batch_size: int, learning_rate: float
 ) -> None:
-    network = student.actor.one_pass
     optimizer = th.optim.Adam(network.parameters(), lr=learning_rate)
     for step in range(gradient_steps):
         for group in optimizer.param_groups:
@@ -76,7 +77,6 @@ def _imitate(
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
-    student.actor_target.one_pass.load_state_dict(network.state_dict())
 
 
 def visited(policy: Policy, env: VecEnv, n_observations: int, normalizer: VecNormalize | None = None) -> list[Any]:

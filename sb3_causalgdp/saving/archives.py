@@ -264,6 +264,19 @@ def is_zip(file: BinaryIO) -> bool:
     return start == b"PK\x03\x04"
 
 
+def is_model(file: BinaryIO) -> bool:
+    """
+    :param file: An open file
+    :return: Whether it is a zip archive in which SB3 saved a model; its position stays
+    """
+    position, found = file.tell(), False
+    if is_zip(file):
+        with zipfile.ZipFile(file) as archive:
+            found = "pytorch_variables.pth" in archive.namelist()
+        file.seek(position)
+    return found
+
+
 def existing(path: str | os.PathLike[str], suffixes: Iterable[str]) -> Path:
     """
     :param path: A path, perhaps without its suffix

@@ -2,7 +2,6 @@
 
 import io
 import pickle
-import zipfile
 from collections.abc import Mapping
 from typing import Any, BinaryIO, TypeVar
 
@@ -12,7 +11,7 @@ from stable_baselines3.common.utils import get_device
 
 from sb3_causalgdp.divergence import first_not_finite
 from sb3_causalgdp.files import write_bytes
-from sb3_causalgdp.saving.archives import TRUST, FileError, errors_of, named, opened, size_of
+from sb3_causalgdp.saving.archives import TRUST, FileError, errors_of, is_model, named, opened, size_of
 from sb3_causalgdp.saving.models import BLOCK, CONTENT, KNOWN, check_limits, check_tensor_file, plain_entries
 from sb3_causalgdp.saving.plain import Known, decoded, read_json
 
@@ -134,13 +133,8 @@ def _read_policy(
     file: BinaryIO, device: th.device, trusted: bool, known: Known
 ) -> tuple[dict[str, th.Tensor], dict[str, Any]]:
     """Parameters, and the arguments of the constructor."""
-    position = file.tell()
-    if zipfile.is_zipfile(file):
-        file.seek(position)
-        with zipfile.ZipFile(file) as archive:
-            if "pytorch_variables.pth" in archive.namelist():
-                raise ValueError("it is a whole model, which CausalGDP.load loads")
-    file.seek(position)
+    if is_model(file):
+        raise ValueError("it is a whole model, which CausalGDP.load loads")
     if trusted:
         saved = th.load(file, map_location=device, weights_only=False)
     else:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
-from sb3_causalgdp.saving.archives import errors_of, is_zip, named, opened, read_arrays, read_pickle
+from sb3_causalgdp.saving.archives import errors_of, is_model, is_zip, named, opened, read_arrays, read_pickle
 from sb3_causalgdp.saving.plain import SPACES, Known, decoded, read_json
 from sb3_causalgdp.sources.chunks import CHUNK_ROWS, Chunk, Source, as_flags, check_numbers, mapped
 from sb3_causalgdp.sources.rewards import RewardTransform, SavedRewards
@@ -263,14 +263,9 @@ def content_of(path: Any, trusted: bool = False) -> tuple[dict[str, np.ndarray] 
     :raises ValueError: If it is neither
     """
     with opened(path) as file:
-        if not is_zip(file):
-            return None, read_pickle(file, trusted)
-        position = file.tell()
-        with zipfile.ZipFile(file) as archive:
-            if "pytorch_variables.pth" in archive.namelist():
-                raise ValueError(f"{named(path)} is a model, which is saved without its buffer: {HOW_TO_SAVE}")
-        file.seek(position)
-        return read_arrays(file), None
+        if is_model(file):
+            raise ValueError(f"{named(path)} is a model, which is saved without its buffer: {HOW_TO_SAVE}")
+        return (read_arrays(file), None) if is_zip(file) else (None, read_pickle(file, trusted))
 
 
 def no_buffer_error(content: Any, path: Any) -> ValueError:
