@@ -146,20 +146,20 @@ class D3rlpyLearner:
     One of d3rlpy's algorithms (https://github.com/takuseno/d3rlpy) with standardised observations, on batches drawn as SB3
     draws them: uniformly, the transitions at the end of a cut episode included.
 
-    :param dataset_id: Minari's id of the dataset
+    :param data: The transitions, as :func:`~benchmarks.offline.data.transitions` gives them
     :param seed: Seed
     :param name: Name of the algorithm
     :param kwargs: Arguments of its configuration
     :raises ImportError: Without d3rlpy
     """
 
-    def __init__(self, dataset_id: str, seed: int, name: str, kwargs: dict[str, Any]) -> None:
+    def __init__(self, data: dict[str, np.ndarray], seed: int, name: str, kwargs: dict[str, Any]) -> None:
         import d3rlpy
 
         d3rlpy.seed(seed)
         self.seed = seed
         self.rng = np.random.default_rng(seed)
-        self.data = transitions(dataset_id)
+        self.data = data
         self.make_batch = d3rlpy.dataset.TransitionMiniBatch
         observations = self.data["observations"]
         kwargs = dict(kwargs)
@@ -259,7 +259,7 @@ def make_learner(method: str, task: str, seed: int, dataset_id: str, overrides: 
         return Planner(task)
     if method in D3RLPY_METHODS:
         name, kwargs = D3RLPY_METHODS[method]
-        return D3rlpyLearner(dataset_id, seed, name, {**kwargs, **overrides})
+        return D3rlpyLearner(transitions(dataset_id), seed, name, {**kwargs, **overrides})
     if method not in CAUSALGDP_METHODS:
         raise ValueError(f"method must be one of {', '.join(METHODS)}, got {method!r}")
     return CausalGDPLearner(dataset_id, seed, {**study_arguments(task), **CAUSALGDP_METHODS[method], **overrides})
