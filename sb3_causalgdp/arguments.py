@@ -1,6 +1,7 @@
 """What the arguments of the algorithm and of its policy accept: one table each."""
 
 import difflib
+import importlib.util
 import inspect
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
@@ -63,6 +64,7 @@ MOST_THREADS = 1_024
 WIDEST_LAYER = 65_536
 MOST_LAYERS = LONGEST
 MOST_CRITICS = 100
+MOST_QUANTILES = 1_000
 MOST_NAMES = 1_000_000
 LARGEST_NOISE = 10.0
 ACTION_PRECISION = 1e-3  # of an action's half range
@@ -261,6 +263,8 @@ POLICY_ARGUMENTS: dict[str, Kind] = {
     ),
     "optimizer_kwargs": KEYWORDS | NONE,
     "n_critics": integer(1, MOST_CRITICS),
+    "n_quantiles": integer(1, MOST_QUANTILES) | NONE,
+    "top_quantiles_to_drop_per_net": integer(0, MOST_QUANTILES - 1),
     "critic_normalization": choice(CRITIC_NORMALIZATIONS) | NONE,
     "normalize_observations": FLAG,
     "prediction_type": choice(PREDICTION_TYPES),
@@ -307,6 +311,19 @@ def check_arguments(table: Mapping[str, Kind], values: Mapping[str, Any]) -> dic
 def _shown(value: Any) -> str:
     text = " ".join(repr(value).split())
     return text if len(text) <= 100 else f"{text[:97]}..."
+
+
+def check_quantiles(n_quantiles: int, n_dropped: int) -> None:
+    """
+    :param n_quantiles: Number of quantiles of a critic
+    :param n_dropped: How many of them do not count
+    :raises ValueError: If none counts
+    :raises ImportError: Without sb3-contrib, whose loss they learn by
+    """
+    if n_dropped >= n_quantiles:
+        raise ValueError(f"top_quantiles_to_drop_per_net must be below n_quantiles={n_quantiles}, got {n_dropped}")
+    if importlib.util.find_spec("sb3_contrib") is None:
+        raise ImportError(f"n_quantiles={n_quantiles} needs the loss of sb3-contrib: pip install sb3-contrib")
 
 
 def check_keywords(name: str, keywords: Iterable[str], function: Callable[..., Any]) -> None:

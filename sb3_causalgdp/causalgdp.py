@@ -375,6 +375,10 @@ class CausalGDP(AskedAlgorithm, DistilledAlgorithm, CheckedAlgorithm):
             raise ValueError(
                 "pessimism must be a number with n_critics=1, got 'auto': one critic is its own mean and smallest"
             )
+        if self.pessimism == "auto" and self.policy.n_quantiles is not None:
+            raise ValueError(
+                "pessimism must be a number with n_quantiles, got 'auto': how many quantiles are dropped is how pessimistic they are"
+            )
         if self.policy.critic.normalizes_batches:
             for name, without in (("max_q_backup", False), ("expectile", None)):
                 value = getattr(self, name)

@@ -69,6 +69,46 @@ def critic_loss(q_values: Sequence[th.Tensor], target: th.Tensor) -> th.Tensor:
     return th.stack([F.mse_loss(values, target) for values in q_values]).sum()
 
 
+def quantile_td_target(
+    next_quantiles: Sequence[th.Tensor],
+    rewards: th.Tensor,
+    dones: th.Tensor,
+    discounts: th.Tensor | float,
+    n_backup_actions: int = 1,
+    n_kept: int = 1,
+) -> th.Tensor:
+    """
+    ``r + gamma (1 - done) z``, where z are the smallest quantiles of all critics together (TQC, Kuznetsov et al., 2020).
+
+    With several actions per next state, that counts whose quantiles have the largest mean.
+
+    :param next_quantiles: Of each critic, each of shape ``(batch * n_backup_actions, n_quantiles)``
+    :param rewards: Shape ``(batch, 1)``
+    :param dones: 1 where the episode terminated, a truncation bootstraps, shape ``(batch, 1)``
+    :param discounts: gamma, or gamma^n of n-step returns, shape ``(batch, 1)``
+    :param n_backup_actions: Number of actions per next state
+    :param n_kept: How many quantiles of a critic count
+    :return: Shape ``(batch, n_critics * n_kept)``
+    """
+    smallest = th.cat(list(next_quantiles), dim=1).sort(dim=1).values[:, : len(next_quantiles) * n_kept]
+    if n_backup_actions > 1:
+        smallest = smallest.view(-1, n_backup_actions, smallest.shape[1])
+        best = smallest.mean(dim=2, keepdim=True).argmax(dim=1, keepdim=True)
+        smallest = smallest.take_along_dim(best, dim=1).squeeze(1)
+    return rewards + (1.0 - dones) * discounts * smallest
+
+
+def quantile_critic_loss(quantiles: Sequence[th.Tensor], target: th.Tensor) -> th.Tensor:
+    """
+    :param quantiles: Of each critic, each of shape ``(batch, n_quantiles)``
+    :param target: What they are compared with, shape ``(batch, n_target_quantiles)``
+    :return: sb3-contrib's quantile Huber loss, the mean over critics and pairs of quantiles
+    """
+    from sb3_contrib.common.utils import quantile_huber_loss
+
+    return quantile_huber_loss(th.stack(list(quantiles), dim=1), target.unsqueeze(1), sum_over_quantiles=False)
+
+
 def denoising_loss(
     denoiser: Denoiser,
     schedule: NoiseSchedule,

@@ -46,9 +46,23 @@ def activation_class(activation_fn: str | type[nn.Module]) -> type[nn.Module]:
     return ACTIVATIONS[activation_fn.lower()]
 
 
-def q_values(
-    critic: ContinuousCritic, features: th.Tensor, actions: th.Tensor, networks: slice = slice(None)
+def network_outputs(
+    critic: "Critic", features: th.Tensor, actions: th.Tensor, networks: slice = slice(None)
 ) -> list[th.Tensor]:
+    """
+    What each critic network gives for features that are known already.
+
+    :param critic: The critics
+    :param features: Shape ``(batch, features_dim)``
+    :param actions: In [-1, 1], shape ``(batch, d)``
+    :param networks: Which of the networks, all by default
+    :return: For each network, Q, shape ``(batch, 1)``, or the quantiles of the return, shape ``(batch, n_quantiles)``
+    """
+    inputs = th.cat([features, _modelled(critic, actions)], dim=1)
+    return [network(inputs) for network in critic.q_networks[networks]]
+
+
+def q_values(critic: "Critic", features: th.Tensor, actions: th.Tensor, networks: slice = slice(None)) -> list[th.Tensor]:
     """
     What each critic network says of features that are known already; the critic itself extracts them anew.
 
@@ -58,11 +72,10 @@ def q_values(
     :param networks: Which of the networks, all by default
     :return: One tensor of shape ``(batch, 1)`` for each network
     """
-    inputs = th.cat([features, _modelled(critic, actions)], dim=1)
-    return [network(inputs) for network in critic.q_networks[networks]]
+    return [critic.value_of(outputs) for outputs in network_outputs(critic, features, actions, networks)]
 
 
-def smallest_q(critic: ContinuousCritic, features: th.Tensor, actions: th.Tensor) -> th.Tensor:
+def smallest_q(critic: "Critic", features: th.Tensor, actions: th.Tensor) -> th.Tensor:
     """
     :param critic: The critics
     :param features: Shape ``(batch, features_dim)``
@@ -72,7 +85,7 @@ def smallest_q(critic: ContinuousCritic, features: th.Tensor, actions: th.Tensor
     return th.cat(q_values(critic, features, actions), dim=1).amin(dim=1, keepdim=True)
 
 
-def hoped_q(critic: ContinuousCritic, features: th.Tensor, actions: th.Tensor, optimism: float) -> th.Tensor:
+def hoped_q(critic: "Critic", features: th.Tensor, actions: th.Tensor, optimism: float) -> th.Tensor:
     """
     :param critic: The critics
     :param features: Shape ``(batch, features_dim)``
@@ -103,6 +116,8 @@ class Critic(PickledAlone, ContinuousCritic):
         the batch, as in CrossQ; None for none
     :param value_network: Whether there is a network V(s) beside them
     :param gates_actions: Whether components of actions can be hidden from it, by the buffer ``action_gate``
+    :param n_quantiles: Number of quantiles of the return that each network gives, None for its mean alone
+    :param top_quantiles_to_drop_per_net: How many of the largest do not count in what it says of an action
     :param kwargs: Keyword arguments of SB3's critics
     """
 
@@ -116,9 +131,13 @@ class Critic(PickledAlone, ContinuousCritic):
         normalization: str | None = None,
         value_network: bool = False,
         gates_actions: bool = False,
+        n_quantiles: int | None = None,
+        top_quantiles_to_drop_per_net: int = 2,
         **kwargs: Any,
     ) -> None:
         super().__init__(**kwargs)
+        self.n_quantiles = n_quantiles
+        self.n_kept = 1 if n_quantiles is None else n_quantiles - top_quantiles_to_drop_per_net
         gate = th.ones(get_action_dim(kwargs["action_space"])) if gates_actions else None
         self.register_buffer("action_gate", gate, persistent=False)
         n_inputs = kwargs["features_dim"] + get_action_dim(kwargs["action_space"])
@@ -130,8 +149,8 @@ class Critic(PickledAlone, ContinuousCritic):
                 "pre_linear_modules": [partial(nn.BatchNorm1d, eps=self.BATCH_NORM_EPSILON, momentum=self.BATCH_NORM_MOMENTUM)]
             }
         for index, network in enumerate(self.q_networks):
-            if norms:
-                layers = create_mlp(n_inputs, 1, kwargs["net_arch"], kwargs["activation_fn"], **norms)
+            if norms or n_quantiles is not None:
+                layers = create_mlp(n_inputs, n_quantiles or 1, kwargs["net_arch"], kwargs["activation_fn"], **norms)
                 self.q_networks[index] = network = nn.Sequential(*layers)
                 setattr(self, f"qf{index}", network)
             make_layers_fast(network)
@@ -144,7 +163,26 @@ class Critic(PickledAlone, ContinuousCritic):
         self._batch_norms = tuple(module for module in modules if isinstance(module, nn.BatchNorm1d))
 
     def forward(self, obs: PyTorchObs, actions: th.Tensor) -> tuple[th.Tensor, ...]:
-        return super().forward(obs, _modelled(self, actions))  # type: ignore[arg-type]  # SB3 gives dictionaries, too
+        return tuple(map(self.value_of, self.outputs(obs, actions)))
+
+    def outputs(self, observations: PyTorchObs, actions: th.Tensor) -> tuple[th.Tensor, ...]:
+        """
+        :param observations: Of the batch
+        :param actions: Shape ``(batch, d)``
+        :return: What is learned, as :func:`network_outputs` gives it
+        """
+        return super().forward(observations, _modelled(self, actions))  # type: ignore[arg-type]  # dictionaries, too
+
+    def value_of(self, outputs: th.Tensor) -> th.Tensor:
+        """
+        :param outputs: Of a network
+        :return: Q: with quantiles, the mean of those that count (TQC, Kuznetsov et al., 2020), shape ``(batch, 1)``
+        """
+        if self.n_quantiles is None:
+            return outputs
+        if self.n_kept < self.n_quantiles:
+            outputs = outputs.sort(dim=1).values[:, : self.n_kept]
+        return outputs.mean(dim=1, keepdim=True)
 
     @property
     def normalizes_batches(self) -> bool:
@@ -196,12 +234,12 @@ class Critic(PickledAlone, ContinuousCritic):
         :param actions: Shape ``(batch, d)``
         :param next_observations: That followed
         :param next_actions: In these, shape ``(batch, d)``
-        :return: Q of the first and of the second, one of shape ``(batch, 1)`` for each critic
+        :return: What :func:`network_outputs` gives for the first and for the second
         """
         features = self.extract_features(observations, self.features_extractor)
         with th.no_grad():
             next_features = self.extract_features(next_observations, self.features_extractor)
-        both = q_values(self, th.cat([features, next_features]), th.cat([actions, next_actions]))
+        both = network_outputs(self, th.cat([features, next_features]), th.cat([actions, next_actions]))
         n_rows = len(actions)
         return [values[:n_rows] for values in both], [values[n_rows:].detach() for values in both]
 

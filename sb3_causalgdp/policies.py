@@ -22,7 +22,7 @@ from torch import nn
 from sb3_causalgdp.abstraction import AbstractingPolicy
 from sb3_causalgdp.acceleration.acting import NumpyActing, OnePassActing
 from sb3_causalgdp.acceleration.activations import fast
-from sb3_causalgdp.arguments import POLICY_ARGUMENTS, check_arguments, check_keywords
+from sb3_causalgdp.arguments import POLICY_ARGUMENTS, check_arguments, check_keywords, check_quantiles
 from sb3_causalgdp.causal import (
     MaskedWorldModel,
     TransitionVariables,
@@ -57,6 +57,10 @@ class CausalGDPPolicy(AbstractingPolicy):
     :param optimizer_class: Optimizer of the actor, the critics and the world model
     :param optimizer_kwargs: Its keyword arguments, without the learning rate
     :param n_critics: Number of critics
+    :param n_quantiles: Number of quantiles of the return that each critic learns, in place of its mean (TQC, Kuznetsov et al.,
+        2020, https://arxiv.org/abs/2005.04269): TD targets are then the smallest quantiles of all critics together, whatever
+        the ``pessimism``, and actor, guidance and candidates are judged by the mean of the smallest; needs sb3-contrib
+    :param top_quantiles_to_drop_per_net: How many of a critic's quantiles, the largest, do not count
     :param critic_normalization: ``batch`` normalises the inputs of the critics' layers over the batch, and needs no target
         critics (CrossQ, Bhatt et al., 2024); ``layer`` normalises their hidden layers, which limits extrapolation to actions
         that are not in the data (RLPD, Ball et al., 2023, section 4.2): for offline data; None does neither
@@ -116,6 +120,8 @@ class CausalGDPPolicy(AbstractingPolicy):
         optimizer_class: type[th.optim.Optimizer] = th.optim.Adam,
         optimizer_kwargs: dict[str, Any] | None = None,
         n_critics: int = 2,
+        n_quantiles: int | None = None,
+        top_quantiles_to_drop_per_net: int = 2,
         critic_normalization: str | None = "batch",
         normalize_observations: bool = True,
         share_features_extractor: bool = False,
@@ -146,6 +152,8 @@ class CausalGDPPolicy(AbstractingPolicy):
         check_arguments(POLICY_ARGUMENTS, locals())
         check_keywords("features_extractor_kwargs", features_extractor_kwargs or {}, features_extractor_class)
         check_keywords("optimizer_kwargs", optimizer_kwargs or {}, optimizer_class)
+        if n_quantiles is not None:
+            check_quantiles(n_quantiles, top_quantiles_to_drop_per_net)
         gates_actions = denoiser == "mlp" and not one_pass
         if causal_abstraction == "auto":
             gates_states = StandardizedExtractor.may_cover(features_extractor_class)
@@ -189,6 +197,8 @@ class CausalGDPPolicy(AbstractingPolicy):
         self.net_arch = [256, 256] if net_arch is None else net_arch
         self.activation_fn = activation_class(activation_fn)
         self.n_critics = n_critics
+        self.n_quantiles = n_quantiles
+        self.top_quantiles_to_drop_per_net = top_quantiles_to_drop_per_net
         self.critic_normalization = critic_normalization
         self.normalize_observations = normalize_observations
         self.share_features_extractor = share_features_extractor
@@ -221,6 +231,8 @@ class CausalGDPPolicy(AbstractingPolicy):
             "activation_fn": fast(self.activation_fn),
             "net_arch": critic_arch,
             "n_critics": n_critics,
+            "n_quantiles": n_quantiles,
+            "top_quantiles_to_drop_per_net": top_quantiles_to_drop_per_net,
             "normalization": critic_normalization,
             "value_network": value_network,
             "share_features_extractor": share_features_extractor,
@@ -311,6 +323,8 @@ class CausalGDPPolicy(AbstractingPolicy):
             optimizer_class=self.optimizer_class,
             optimizer_kwargs=self.optimizer_kwargs,
             n_critics=self.n_critics,
+            n_quantiles=self.n_quantiles,
+            top_quantiles_to_drop_per_net=self.top_quantiles_to_drop_per_net,
             critic_normalization=self.critic_normalization,
             normalize_observations=self.normalize_observations,
             share_features_extractor=self.share_features_extractor,

@@ -23,11 +23,13 @@ from sb3_causalgdp.losses import (
     improvement_weights,
     q_loss,
     quantile,
+    quantile_critic_loss,
+    quantile_td_target,
     td_target,
     trust_region_loss,
     world_model_loss,
 )
-from sb3_causalgdp.networks import q_values, smallest_q
+from sb3_causalgdp.networks import network_outputs, q_values, smallest_q
 from sb3_causalgdp.step_plans import StepPlan
 
 Model = Any  # a CausalGDP, whose file imports this one
@@ -148,7 +150,7 @@ class Updates:
         """
         :param replay_data: Sample of a replay buffer
         :return: Actions in the next states, shape ``(batch, d)``, None where a value network is asked; and what critics learn
-            from: the TD target, shape ``(batch, 1)``, or, where they normalise batches, the next actions for which they say it
+            from: the TD target, as :meth:`td_target` gives it, or, where they normalise batches, the next actions for which they say it
             themselves in ``critic_gradients``, shape ``(batch, d)``
         """
         n_actions = self.N_BACKUP_ACTIONS if self.model.max_q_backup else 1
@@ -163,19 +165,21 @@ class Updates:
                 return next_actions, self.smoothed(next_actions)
             critic_features = self.critic_target.extract_features(next_observations, self.critic_target.features_extractor)
             critic_features, smoothed = critic_features.repeat_interleave(n_actions, dim=0), self.smoothed(next_actions)
-            next_q_values = q_values(self.critic_target, critic_features, smoothed)
-        return next_actions[::n_actions], self.td_target(next_q_values, replay_data, n_actions)
+            following = network_outputs(self.critic_target, critic_features, smoothed)
+        return next_actions[::n_actions], self.td_target(following, replay_data, n_actions)
 
-    def td_target(self, next_q_values: list[th.Tensor], replay_data, n_actions: int = 1) -> th.Tensor:
+    def td_target(self, following: list[th.Tensor], replay_data, n_actions: int = 1) -> th.Tensor:
         """
-        :param next_q_values: Of the next states, one for each critic, shape ``(n_actions * batch, 1)``
+        :param following: Of the next states, what each critic gives, or the value network alone
         :param replay_data: Sample of a replay buffer
         :param n_actions: Number of actions that are tried in each next state
-        :return: What Q should be, without a gradient, shape ``(batch, 1)``
+        :return: What the critics' outputs should be, without a gradient, shape ``(batch, 1)``, or ``(batch, quantiles)``
         """
         with th.no_grad():
             of_batch = (replay_data.rewards, replay_data.dones, self.discounts(replay_data))
-            return td_target(next_q_values, *of_batch, n_actions, self.pessimism)
+            if self.critic.n_quantiles is None or self.model.expectile is not None:
+                return td_target(following, *of_batch, n_actions, self.pessimism)
+            return quantile_td_target(following, *of_batch, n_actions, self.critic.n_kept)
 
     def discounts(self, replay_data) -> th.Tensor | float:
         """
@@ -213,13 +217,14 @@ class Updates:
         observations, actions = replay_data.observations, replay_data.actions
         if self.critic.normalizes_batches:
             # CrossQ: no target critics, (s, a) and (s', a') in one batch
-            q, next_q = self.critic.forward_both(observations, actions, replay_data.next_observations, for_critics)
-            target = self.td_target(next_q, replay_data)
+            outputs, following = self.critic.forward_both(observations, actions, replay_data.next_observations, for_critics)
+            target = self.td_target(following, replay_data)
         else:
-            q, target = self.critic(observations, actions), for_critics
-        target_std, target_mean = th.std_mean(target, correction=0)
+            outputs, target = self.critic.outputs(observations, actions), for_critics
+        has_quantiles = self.critic.n_quantiles is not None
+        target_std, target_mean = th.std_mean(target.mean(dim=1) if has_quantiles else target, correction=0)
         target_std = th.where(moves(target_std, target_mean), target_std, 1.0)
-        loss = critic_loss(q, target)
+        loss = (quantile_critic_loss if has_quantiles else critic_loss)(outputs, target)
         if self.model.expectile is not None:
             with th.no_grad():
                 of_data = self.critic_target.smallest(observations, actions)

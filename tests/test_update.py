@@ -311,6 +311,8 @@ COMPILABLE = {
     "residual_mlp": {"policy_kwargs": {"net_arch": [8], "denoiser": "residual_mlp"}},
     "transformer": {"policy_kwargs": {"net_arch": [8], "denoiser": "transformer", "denoiser_kwargs": {"causal": True}}},
     "one critic": {"policy_kwargs": {"net_arch": [8], "n_critics": 1}},
+    "quantiles": {"policy_kwargs": {"net_arch": [8], "n_quantiles": 5}},
+    "quantiles, layer norm": {"policy_kwargs": {"net_arch": [8], "n_quantiles": 3, "critic_normalization": "layer"}},
     "layer norm": {"policy_kwargs": {"net_arch": [8], "critic_normalization": "layer"}},
     "clipped": {"max_grad_norm": 0.1},
     "max_q_backup": {"max_q_backup": True, "policy_kwargs": {"net_arch": [8], **AS_THEY_ARE}},

@@ -203,7 +203,8 @@ class _Hidden(NamedTuple):
 class _Critic:
     """One target critic."""
 
-    def __init__(self, network: nn.Sequential, activation_fn: type[nn.Module]) -> None:
+    def __init__(self, network: nn.Sequential, activation_fn: type[nn.Module], n_kept: int) -> None:
+        self.n_kept = n_kept
         modules, batch_norms = without_batch_norms(network)
         modules, norms = without_norms(modules)
         self.layers = layers = linear_layers(modules)
@@ -219,10 +220,18 @@ class _Critic:
         for norm, (next_weight, next_bias) in zip(self.norms, layers, strict=True):
             hidden = next_weight.dot(self._hidden(norm, hidden).output)
             hidden += next_bias
-        return hidden
+        return self.value_of(hidden)
+
+    def value_of(self, outputs: np.ndarray) -> np.ndarray:
+        """Q, shape ``(batch,)``, of the outputs, one or the quantiles, shape ``(n_outputs, batch)``."""
+        if len(outputs) == 1:
+            return outputs[0]
+        if self.n_kept < len(outputs):
+            outputs = np.partition(outputs, self.n_kept - 1, axis=0)[: self.n_kept]
+        return outputs.mean(axis=0)
 
     def forward(self, inputs: np.ndarray) -> tuple[np.ndarray, list[_Hidden]]:
-        """The values, and the hidden layers."""
+        """The outputs, and the hidden layers."""
         hidden = []
         *layers, (last_weight, last_bias) = self._layers()
         for norm, (weight, bias) in zip(self.norms, layers, strict=True):
@@ -246,11 +255,16 @@ class _Critic:
         normalised = product if norm is None else norm(product)
         return _Hidden(product, normalised, self.activation.value(normalised))
 
-    def backward(self, hidden: list[_Hidden], n_states: int) -> np.ndarray:
-        """Gradient of the values by the states, the first of the inputs."""
+    def backward(self, outputs: np.ndarray, hidden: list[_Hidden], n_states: int) -> np.ndarray:
+        """Gradient of Q by the states, the first of the inputs."""
         weights = [weight for weight, _ in self._layers()]
         weights[0] = weights[0][:, :n_states]
         gradient = weights[-1].T
+        if self.n_kept < len(outputs):
+            smallest = np.argpartition(outputs, self.n_kept - 1, axis=0)[: self.n_kept]
+            gradient = weights[-1][smallest].mean(axis=0).T
+        elif self.n_kept > 1:
+            gradient = gradient.mean(axis=1, keepdims=True)
         for weight, layer, norm in zip(weights[-2::-1], reversed(hidden), reversed(self.norms), strict=True):
             gradient = gradient * self.activation.derivative(layer.normalised, layer.output)
             gradient = weight.T.dot(gradient if norm is None else norm.backward(gradient, layer.product))
@@ -261,11 +275,12 @@ class Critics:
     """The target critics: Q of candidates, and the gradient of the smallest by the state."""
 
     def __init__(self, policy: Policy) -> None:
-        self.networks = [_Critic(network, policy.activation_fn) for network in policy.critic_target.q_networks]
+        critic = policy.critic_target
+        self.networks = [_Critic(network, policy.activation_fn, critic.n_kept) for network in critic.q_networks]
 
     def values(self, features: np.ndarray, actions: np.ndarray, n_candidates: int, optimism: float) -> np.ndarray:
         """Q of several actions for each features, between the smallest, for -1, and the largest, for 1."""
-        values = [network.values(features, actions, n_candidates)[0] for network in self.networks]
+        values = [network.values(features, actions, n_candidates) for network in self.networks]
         extreme = reduce(np.maximum if optimism > 0.0 else np.minimum, values)
         if abs(optimism) == 1.0:
             return extreme
@@ -276,14 +291,16 @@ class Critics:
         """Of the smallest Q, by the state, shape ``(n, batch)``."""
         inputs = np.concatenate([state, action])
         passes = [network.forward(inputs) for network in self.networks]
-        smallest = np.argmin(np.concatenate([values for values, _ in passes]), axis=0)
+        values = [network.value_of(outputs) for network, (outputs, _) in zip(self.networks, passes, strict=True)]
+        smallest = np.argmin(np.stack(values), axis=0)
         if len(set(smallest.tolist())) == 1:
-            return self.networks[smallest[0]].backward(passes[smallest[0]][1], len(state))
+            return self.networks[smallest[0]].backward(*passes[smallest[0]], len(state))
         gradient = np.empty_like(state)
-        for index, (network, (_, hidden)) in enumerate(zip(self.networks, passes, strict=True)):
+        for index, (network, (outputs, hidden)) in enumerate(zip(self.networks, passes, strict=True)):
             columns = smallest == index
             if columns.any():
-                gradient[:, columns] = network.backward([layer.columns(columns) for layer in hidden], len(state))
+                of_columns = [layer.columns(columns) for layer in hidden]
+                gradient[:, columns] = network.backward(outputs[:, columns], of_columns, len(state))
         return gradient
 
 

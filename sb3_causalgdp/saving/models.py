@@ -68,6 +68,7 @@ LIMITS = {
     "gradient_steps": 100_000,
     "n_action_candidates": 10_000,
     "n_critics": 1_000,
+    "n_quantiles": 1_000,
     "n_envs": 10_000,
     "n_steps": 10_000,
     "pretrain_steps": 100_000_000,
