@@ -130,6 +130,7 @@ def _needs_no_closure(value: type) -> bool:
 STEPS = integer(1, MOST_STEPS)
 SHARE = number(0.0, 1.0)
 OPTIMISM = number(-1.0, 1.0)
+TEMPERATURE = number(0.0, 100.0)
 NAMES = sequence(TEXT, "a list of names, each another one", 1, MOST_NAMES, different=True)
 WEIGHT = number(0.0, LARGEST_WEIGHT)
 RATE = schedule(WEIGHT)
@@ -192,6 +193,7 @@ GROUPS: dict[str, dict[str, Kind]] = {
         "action_noise": instance(ActionNoise, "an ActionNoise") | NONE,
         "exploration_noise": schedule(NOISE),
         "exploration_optimism": OPTIMISM,
+        "exploration_temperature": TEMPERATURE,
         "replay_buffer_class": subclass(ReplayBuffer, "a subclass of ReplayBuffer") | NONE,
         "replay_buffer_kwargs": KEYWORDS | NONE,
         "optimize_memory_usage": FLAG,
@@ -276,6 +278,7 @@ POLICY_ARGUMENTS: dict[str, Kind] = {
     "n_action_candidates": CANDIDATES,
     "exploration_noise": NOISE,
     "exploration_optimism": OPTIMISM,
+    "exploration_temperature": TEMPERATURE,
     **DIFFUSION_ARGUMENTS,
     **GUIDANCE_ARGUMENTS,
     "sampling_steps": integer(1, MOST_DIFFUSION_STEPS) | NONE,

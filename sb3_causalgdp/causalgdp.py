@@ -42,6 +42,7 @@ from sb3_causalgdp.step_plans import StepPlan, dealt
 from sb3_causalgdp.updates import Losses, Updates, optimizer_of
 
 SelfCausalGDP = TypeVar("SelfCausalGDP", bound="CausalGDP")
+OF_CANDIDATES = ("n_action_candidates", "exploration_optimism", "exploration_temperature")
 
 
 class CausalGDP(AskedAlgorithm, DistilledAlgorithm, CheckedAlgorithm):
@@ -115,6 +116,8 @@ class CausalGDP(AskedAlgorithm, DistilledAlgorithm, CheckedAlgorithm):
     :param exploration_optimism: By what non-deterministic predictions judge candidates, in [-1, 1]: 1 for the largest of the
         critics' Q, 0 for their mean, -1 for the smallest, by which deterministic ones always do. What the critics disagree
         about is tried then (optimistic exploration, Ciosek et al., 2019, https://arxiv.org/abs/1910.12807)
+    :param exploration_temperature: How random the choice among candidates is in non-deterministic predictions: one is drawn
+        with a probability proportional to exp(Q / (temperature * standard deviation of the candidates' Q)); 0 for the best
     :param guidance: ``posterior`` (the gradient of log p(y | a^k), which accounts for the uncertainty of the clean action),
         ``score`` (the paper's plain gradient), ``normalized`` (unit length), or None
     :param guidance_target: What to aim for: ``return`` (one standard deviation of Q more than predicted) or ``reward`` (r*,
@@ -231,6 +234,7 @@ class CausalGDP(AskedAlgorithm, DistilledAlgorithm, CheckedAlgorithm):
         n_action_candidates: int = 10,
         exploration_noise: float | Schedule = 0.2,
         exploration_optimism: float = 1.0,
+        exploration_temperature: float = 0.0,
         guidance: str | None = "posterior",
         guidance_target: str = "return",
         guidance_covariance: str = "unit_gaussian",
@@ -324,6 +328,7 @@ class CausalGDP(AskedAlgorithm, DistilledAlgorithm, CheckedAlgorithm):
         self.n_action_candidates = n_action_candidates
         self.exploration_noise = exploration_noise
         self.exploration_optimism = exploration_optimism
+        self.exploration_temperature = exploration_temperature
         self.guidance = guidance
         self.guidance_target = guidance_target
         self.guidance_covariance = guidance_covariance
@@ -377,7 +382,7 @@ class CausalGDP(AskedAlgorithm, DistilledAlgorithm, CheckedAlgorithm):
             )
         if self.pessimism == "auto" and self.policy.n_quantiles is not None:
             raise ValueError(
-                "pessimism must be a number with n_quantiles, got 'auto': how many quantiles are dropped is how pessimistic they are"
+                "pessimism must be a number with n_quantiles, got 'auto': they are as pessimistic as many are dropped"
             )
         if self.policy.critic.normalizes_batches:
             for name, without in (("max_q_backup", False), ("expectile", None)):
@@ -404,10 +409,7 @@ class CausalGDP(AskedAlgorithm, DistilledAlgorithm, CheckedAlgorithm):
         self._check_together()
 
     def _own_policy_kwargs(self) -> dict[str, Any]:
-        own = {
-            name: getattr(self, name)
-            for name in ("n_action_candidates", "exploration_optimism", *DIFFUSION_ARGUMENTS, *GUIDANCE_ARGUMENTS)
-        }
+        own = {name: getattr(self, name) for name in (*OF_CANDIDATES, *DIFFUSION_ARGUMENTS, *GUIDANCE_ARGUMENTS)}
         own["exploration_noise"] = FloatSchedule(self.exploration_noise)(1.0)
         networks = {"one_pass": self.actor_update == "trust_region", "value_network": self.expectile is not None}
         asked = {name: True for name, is_asked in networks.items() if is_asked}

@@ -26,7 +26,7 @@ from torch.fx.node import map_arg
 from sb3_causalgdp.causal import TransitionVariables
 from sb3_causalgdp.files import replaced_when_done
 from sb3_causalgdp.hints import how_to_install
-from sb3_causalgdp.prediction import act_in_torch
+from sb3_causalgdp.prediction import act_in_torch, choice_noise, draws_candidates
 
 Policy = Any  # a CausalGDPPolicy, whose file imports this one
 Arrays = list[np.ndarray]
@@ -106,6 +106,7 @@ class ExportedPolicy(nn.Module):
         self.guided = guided
         self.deterministic = deterministic
         self.explores = not deterministic and policy.exploration_noise > 0.0
+        self.draws = draws_candidates(policy, deterministic)
         self.normalizer = vec_normalize if vec_normalize is not None and vec_normalize.norm_obs else None
         space = policy.observation_space if self.normalizer is None else _space_below(self.normalizer, policy)
         self.is_dict = isinstance(space, spaces.Dict)
@@ -132,6 +133,8 @@ class ExportedPolicy(nn.Module):
         shapes: dict[str, tuple[int, ...]] = {}
         if not self.deterministic:
             shapes["noise"] = (n_steps, n_candidates, action_dim)
+        if self.draws:
+            shapes["choice_noise"] = (n_candidates,)
         return {**shapes, "exploration_noise": (action_dim,)} if self.explores else shapes
 
     @property
@@ -150,7 +153,8 @@ class ExportedPolicy(nn.Module):
         else:
             noise = inputs[len(self.spaces)].transpose(0, 1)
         features = self.policy.acting_actor(self.deterministic).features(observation)
-        action = act_in_torch(self.policy, observation, features, noise.flatten(1, 2), self.deterministic, self.guided)
+        how = (self.deterministic, self.guided, inputs[len(self.spaces) + 1] if self.draws else None)
+        action = act_in_torch(self.policy, observation, features, noise.flatten(1, 2), *how)
         if self.explores:
             action = (action + self.policy.exploration_noise * inputs[-1]).clamp(-1.0, 1.0)
         action = action.reshape(-1, *self.action_low.shape)
@@ -208,8 +212,13 @@ class ExportedPolicy(nn.Module):
             return []
         n_steps, n_candidates, action_dim = shapes["noise"]
         drawn = th.randn(n_steps, n_rows * n_candidates, action_dim)
-        of_candidates = drawn.view(n_steps, n_rows, n_candidates, action_dim).transpose(0, 1).contiguous()
-        return [tensor.numpy() for tensor in (of_candidates, th.randn(n_rows, action_dim))[: len(shapes)]]
+        of_all = [drawn.view(n_steps, n_rows, n_candidates, action_dim).transpose(0, 1).contiguous()]
+        of_choice = choice_noise(self.policy, n_rows, self.deterministic)
+        if of_choice is not None:
+            of_all.append(of_choice)
+        if self.explores:
+            of_all.append(th.randn(n_rows, action_dim))
+        return [tensor.numpy() for tensor in of_all]
 
     def _shape(self, name: str) -> tuple[int, ...]:
         return self.noise_shapes[name] if name in self.noise_shapes else self.spaces[name].shape  # type: ignore[return-value]

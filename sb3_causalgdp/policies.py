@@ -90,6 +90,7 @@ class CausalGDPPolicy(AbstractingPolicy):
     :param exploration_noise: Standard deviation of the Gaussian noise of stochastic predictions, for actions in [-1, 1]
     :param exploration_optimism: What stochastic predictions hope of a candidate: -1 for the smallest Q of the critics, 0 for
         their mean, 1 for the largest
+    :param exploration_temperature: How random the choice among candidates is in stochastic predictions, 0 for the best
     :param discount: Discount factor, for the return target
     :param one_pass: Whether an MLP trained alongside the denoiser does the acting: one pass, without candidates or guidance
         while acting
@@ -143,6 +144,7 @@ class CausalGDPPolicy(AbstractingPolicy):
         n_action_candidates: int = 10,
         exploration_noise: float = 0.2,
         exploration_optimism: float = 1.0,
+        exploration_temperature: float = 0.0,
         discount: float = 0.99,
         one_pass: bool = False,
         value_network: bool = False,
@@ -184,6 +186,7 @@ class CausalGDPPolicy(AbstractingPolicy):
             "n_action_candidates": n_action_candidates,
             "exploration_noise": exploration_noise,
             "exploration_optimism": exploration_optimism,
+            "exploration_temperature": exploration_temperature,
             "discount": discount,
         }
         self.guidance_target = guidance_target
@@ -192,6 +195,7 @@ class CausalGDPPolicy(AbstractingPolicy):
         self.n_action_candidates = n_action_candidates
         self.exploration_noise = exploration_noise
         self.exploration_optimism = exploration_optimism
+        self.exploration_temperature = exploration_temperature
         self.discount = discount
 
         self.net_arch = [256, 256] if net_arch is None else net_arch

@@ -38,7 +38,9 @@ def act(policy: Policy, observation: PyTorchObs, deterministic: bool) -> th.Tens
     if acting is not None:
         assert isinstance(observation, th.Tensor)
         noise = candidate_noise(policy, len(observation), deterministic).cpu().numpy()
-        actions = acting(policy, observation.float().flatten(1).cpu().numpy(), noise, deterministic, policy.is_guided)
+        of_choice = choice_noise(policy, len(observation), deterministic)
+        drawn = (noise, None if of_choice is None else of_choice.cpu().numpy())
+        actions = acting(policy, observation.float().flatten(1).cpu().numpy(), *drawn, deterministic, policy.is_guided)
         return th.as_tensor(actions, device=observation.device)
     with th.no_grad():
         actor = policy.acting_actor(deterministic)
@@ -46,7 +48,8 @@ def act(policy: Policy, observation: PyTorchObs, deterministic: bool) -> th.Tens
         if actor.one_pass is not None:
             return actor.sample(features)
         drawn = candidate_noise(policy, len(features), deterministic)
-        return act_in_torch(policy, observation, features, drawn, deterministic)
+        of_choice = choice_noise(policy, len(features), deterministic)
+        return act_in_torch(policy, observation, features, drawn, deterministic, of_choice=of_choice)
 
 
 def is_traced() -> bool:
@@ -77,6 +80,7 @@ def act_in_torch(
     noise: th.Tensor,
     deterministic: bool,
     guided: bool | None = None,
+    of_choice: th.Tensor | None = None,
 ) -> th.Tensor:
     """
     :param policy: The policy
@@ -85,12 +89,13 @@ def act_in_torch(
     :param noise: Of the candidates, see :func:`candidate_noise`
     :param deterministic: Whether it plays, and does not explore
     :param guided: Whether to steer, None for what the policy says now
+    :param of_choice: Noise of the choice among candidates, see :func:`choice_noise`
     :return: Actions in [-1, 1], shape ``(batch, d)``
     """
     actor = policy.acting_actor(deterministic)
     critic_features = policy.critic_target.extract_features(observation, policy.critic_target.features_extractor)
     candidates = actor.sample(features.repeat_interleave(policy.n_action_candidates, dim=0), noise)
-    best = _best_candidate(policy, critic_features, candidates, policy.acting_optimism(deterministic))
+    best = _chosen_candidate(policy, critic_features, candidates, policy.acting_optimism(deterministic), of_choice)
     action = candidates[best]
     if not (policy.is_guided if guided is None else guided):
         return action
@@ -127,15 +132,44 @@ def candidate_noise(policy: Policy, n_observations: int, deterministic: bool) ->
     return th.randn(n_steps, n_observations * n_candidates, action_dim, device=fixed.device)
 
 
-def _best_candidate(policy: Policy, critic_features: th.Tensor, actions: th.Tensor, optimism: float) -> th.Tensor:
-    """Row of the candidate with the largest target Q, as :func:`hoped_q` says it, for each observation."""
+def draws_candidates(policy: Policy, deterministic: bool) -> bool:
+    """
+    :param policy: The policy
+    :param deterministic: Whether it plays, and does not explore
+    :return: Whether one of the candidates is drawn, in place of the best
+    """
+    return not deterministic and policy.exploration_temperature > 0.0 and policy.n_action_candidates > 1
+
+
+def choice_noise(policy: Policy, n_observations: int, deterministic: bool) -> th.Tensor | None:
+    """
+    Noise with which the candidate of the largest Q is one drawn by a softmax of Q (Gumbel-max).
+
+    :param policy: The policy
+    :param n_observations: Number of observations
+    :param deterministic: Whether it plays, and does not explore
+    :return: Of Gumbel's distribution, shape ``(n_observations, N)``; None where the best is taken
+    """
+    if not draws_candidates(policy, deterministic):
+        return None
+    uniform = th.rand(n_observations, policy.n_action_candidates, device=policy.candidate_noise.device)
+    return -(-uniform.clamp(1e-7, 1.0 - 1e-7).log()).log()
+
+
+def _chosen_candidate(
+    policy: Policy, critic_features: th.Tensor, actions: th.Tensor, optimism: float, of_choice: th.Tensor | None
+) -> th.Tensor:
+    """Row of the candidate with the largest target Q, as :func:`hoped_q` says it, or of one drawn, for each observation."""
     n_candidates = policy.n_action_candidates
     first = th.arange(0, actions.shape[0], n_candidates, device=actions.device)
     if n_candidates == 1:
         return first
     repeated = critic_features.repeat_interleave(n_candidates, dim=0)
-    values = hoped_q(policy.critic_target, repeated, actions, optimism)
-    return first + values.view(-1, n_candidates).argmax(dim=1)
+    values = hoped_q(policy.critic_target, repeated, actions, optimism).view(-1, n_candidates)
+    if of_choice is not None:
+        spread = values.std(dim=1, keepdim=True, correction=0)
+        values = values + policy.exploration_temperature * spread * of_choice
+    return first + values.argmax(dim=1)
 
 
 def check_observation(observation: Any, space: spaces.Space) -> None:

@@ -150,8 +150,8 @@ class Updates:
         """
         :param replay_data: Sample of a replay buffer
         :return: Actions in the next states, shape ``(batch, d)``, None where a value network is asked; and what critics learn
-            from: the TD target, as :meth:`td_target` gives it, or, where they normalise batches, the next actions for which they say it
-            themselves in ``critic_gradients``, shape ``(batch, d)``
+            from: the TD target, as :meth:`td_target` gives it, or, where they normalise batches, the next actions for which
+            they say it themselves in ``critic_gradients``, shape ``(batch, d)``
         """
         n_actions = self.N_BACKUP_ACTIONS if self.model.max_q_backup else 1
         next_observations = replay_data.next_observations

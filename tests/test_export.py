@@ -18,6 +18,7 @@ from torch import nn
 
 from sb3_causalgdp import CausalGDP, CausalWorldModelCallback
 from sb3_causalgdp.export import ExportedPolicy, _solve_by_elimination
+from sb3_causalgdp.prediction import choice_noise
 
 TOLERANCE = 1e-5
 HAS_ONNX = all(importlib.util.find_spec(name) is not None for name in ("onnx", "onnxscript", "onnxruntime"))
@@ -131,9 +132,9 @@ def test_unguided_is_the_policy_without_its_guidance(pendulum, observations, tmp
     assert pendulum.policy.is_guided
 
 
-@pytest.mark.parametrize("exploration_noise", [0.0, 0.3])
-def test_noise_is_an_input_of_what_is_not_deterministic(exploration_noise, observations, tmp_path):
-    model = trained("Pendulum-v1", exploration_noise=exploration_noise)
+@pytest.mark.parametrize(("exploration_noise", "temperature"), [(0.0, 0.0), (0.3, 0.0), (0.3, 1.0), (0.0, 1.0)])
+def test_noise_is_an_input_of_what_is_not_deterministic(exploration_noise, temperature, observations, tmp_path):
+    model = trained("Pendulum-v1", exploration_noise=exploration_noise, exploration_temperature=temperature)
     path = tmp_path / "policy.pt"
     model.export(path, deterministic=False)
     n_rows, n_candidates, n_steps = len(observations), model.n_action_candidates, model.diffusion_steps
@@ -141,10 +142,13 @@ def test_noise_is_an_input_of_what_is_not_deterministic(exploration_noise, obser
     expected, _ = model.predict(observations)
     th.manual_seed(7)
     noise = th.randn(n_steps, n_rows * n_candidates, 1).view(n_steps, n_rows, n_candidates, 1).transpose(0, 1).contiguous()
-    exploration = [th.randn(n_rows, 1).numpy()] if exploration_noise else []
+    of_choice = choice_noise(model.policy, n_rows, deterministic=False)
+    exploration = [] if of_choice is None else [of_choice.numpy()]
+    exploration += [th.randn(n_rows, 1).numpy()] if exploration_noise else []
     np.testing.assert_allclose(run(path, observations, noise.numpy(), *exploration), expected, atol=TOLERANCE)
     names = [one["name"] for one in metadata_of(path)["inputs"]]
-    assert names == ["observation", "noise", "exploration_noise"][: 2 + len(exploration)]
+    asked = ["choice_noise"] * (temperature > 0.0) + ["exploration_noise"] * (exploration_noise > 0.0)
+    assert names == ["observation", "noise", *asked]
 
 
 def test_normalisation_of_observations_is_inside(observations, tmp_path):

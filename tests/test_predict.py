@@ -13,6 +13,7 @@ from torch import nn
 
 from sb3_causalgdp import CausalGDP, CausalWorldModelCallback
 from sb3_causalgdp.networks import hoped_q, q_values
+from sb3_causalgdp.prediction import _chosen_candidate, choice_noise
 
 KWARGS = {**SPREAD, "batch_size": 16, "gradient_steps": 2, "policy_delay": 1}
 
@@ -265,3 +266,23 @@ def test_exploration_hopes_and_playing_does_not(observations):
 
     assert np.abs(predict(1.0, False) - predict(-1.0, False)).max() > 1e-3
     np.testing.assert_array_equal(predict(1.0, True), predict(-1.0, True))
+
+
+def test_a_temperature_draws_candidates_by_a_softmax_of_their_q(monkeypatch):
+    model = train(n_action_candidates=3)
+    policy, values = model.policy, th.tensor([[1.0], [3.0], [2.0]])
+    monkeypatch.setattr("sb3_causalgdp.prediction.hoped_q", lambda critic, features, actions, optimism: values.repeat(2000, 1))
+    features, actions = th.zeros(2000, 3), th.zeros(6000, 1)
+
+    def shares(temperature):
+        policy.exploration_temperature = temperature
+        noise = choice_noise(policy, 2000, deterministic=False)
+        rows = _chosen_candidate(policy, features, actions, -1.0, noise) - 3 * th.arange(2000)
+        return th.bincount(rows, minlength=3) / 2000
+
+    assert shares(0.0).tolist() == [0.0, 1.0, 0.0] and choice_noise(policy, 1, deterministic=False) is None
+    th.manual_seed(0)
+    for temperature in (0.5, 2.0):
+        expected = th.softmax(values[:, 0] / (temperature * values.std(correction=0)), dim=0)
+        th.testing.assert_close(shares(temperature), expected, atol=0.03, rtol=0.0)
+        assert choice_noise(policy, 5, deterministic=True) is None

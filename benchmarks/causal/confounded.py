@@ -1,7 +1,7 @@
 """
 Confounded data: offline learning where the recorded behaviour follows something that will be of no use when acting.
 
-    OMP_NUM_THREADS=1 python -m benchmarks.causal.confounded --task HalfCheetah-v5 --kinds none last_action nuisance --seeds 0 1 2
+    OMP_NUM_THREADS=1 python -m benchmarks.causal.confounded --task HalfCheetah-v5 --kinds none last_action nuisance
     OMP_NUM_THREADS=1 python -m benchmarks.causal.confounded --task maze2d-umaze-dense --kinds none last_action
     OMP_NUM_THREADS=1 ~/d3rlpy-venv/bin/python -m benchmarks.causal.confounded --methods td3_bc
 

@@ -151,11 +151,20 @@ class NumpyActing(_Views):
             and (rule is None or not rule.needs_jacobian)
         )
 
-    def __call__(self, policy: Policy, state: np.ndarray, noise: np.ndarray, deterministic: bool, guided: bool) -> np.ndarray:
+    def __call__(
+        self,
+        policy: Policy,
+        state: np.ndarray,
+        noise: np.ndarray,
+        of_choice: np.ndarray | None,
+        deterministic: bool,
+        guided: bool,
+    ) -> np.ndarray:
         """
         :param policy: The policy, for its settings
         :param state: The observations, float32, shape ``(batch, n)``
         :param noise: Noise of the candidates, shape ``(K, batch * n_action_candidates, d)``
+        :param of_choice: Noise of the choice among them, shape ``(batch, n_action_candidates)``, None for none
         :param deterministic: Whether it plays, and does not explore
         :param guided: Whether the guidance is on
         :return: Actions in [-1, 1], shape ``(batch, d)``
@@ -164,11 +173,19 @@ class NumpyActing(_Views):
             self._copy.refresh()
         # On products this small, several threads of numpy's library mostly wait for each other: ten times the time
         if all(library.num_threads == 1 for library in self._blas.lib_controllers):
-            return self._act(policy, state, noise, deterministic, guided)
+            return self._act(policy, state, noise, of_choice, deterministic, guided)
         with self._blas.limit(limits=1):
-            return self._act(policy, state, noise, deterministic, guided)
+            return self._act(policy, state, noise, of_choice, deterministic, guided)
 
-    def _act(self, policy: Policy, state: np.ndarray, noise: np.ndarray, deterministic: bool, guided: bool) -> np.ndarray:
+    def _act(
+        self,
+        policy: Policy,
+        state: np.ndarray,
+        noise: np.ndarray,
+        of_choice: np.ndarray | None,
+        deterministic: bool,
+        guided: bool,
+    ) -> np.ndarray:
         denoiser, optimism = self.denoisers[bool(deterministic and policy.use_ema)], policy.acting_optimism(deterministic)
         n_candidates = policy.n_action_candidates
         features = self.features(state.T)
@@ -181,6 +198,9 @@ class NumpyActing(_Views):
         action = denoiser.sample(repeated, start, scaled_noise, first_prediction).T
         if n_candidates > 1:
             values = self.critics.values(features, action.T, n_candidates, optimism).reshape(-1, n_candidates)
+            if of_choice is not None:
+                spread = values.std(axis=1, keepdims=True)
+                values = values + np.float32(policy.exploration_temperature) * spread * of_choice
             best = np.arange(0, len(action), n_candidates) + values.argmax(axis=1)
             action, start, first_prediction = action[best], start[:, best], first_prediction[:, best]
             scaled_noise = scaled_noise[:, :, best]

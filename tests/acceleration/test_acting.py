@@ -13,7 +13,7 @@ from sb3_causalgdp import CausalGDP
 from sb3_causalgdp.acceleration.acting import NumpyActing
 from sb3_causalgdp.diffusion import SAMPLERS
 from sb3_causalgdp.offline.replay import SpacesEnv
-from sb3_causalgdp.prediction import act, act_in_torch, candidate_noise
+from sb3_causalgdp.prediction import act, act_in_torch, candidate_noise, choice_noise
 
 N_STATES, N_ACTIONS = 5, 3
 
@@ -56,7 +56,9 @@ def both_paths(policy, observations, deterministic=False):
         fast = act(policy, observations, deterministic)
         th.manual_seed(3)
         noise, actor = candidate_noise(policy, len(observations), deterministic), policy.acting_actor(deterministic)
-        return fast, act_in_torch(policy, observations, actor.features(observations), noise, deterministic)
+        of_choice = choice_noise(policy, len(observations), deterministic)
+        of_torch = (actor.features(observations), noise, deterministic)
+        return fast, act_in_torch(policy, observations, *of_torch, of_choice=of_choice)
 
 
 @pytest.mark.parametrize("optimism", [-1.0, -0.4, 0.0, 0.3, 1.0])
@@ -65,6 +67,16 @@ def test_both_paths_hope_for_the_same(optimism, deterministic):
     policy = make_policy(exploration_optimism=optimism)
     fast, plain = both_paths(policy, np.random.default_rng(0).normal(size=(8, N_STATES)).astype(np.float32), deterministic)
     np.testing.assert_allclose(fast, plain, atol=2e-5)
+
+
+@pytest.mark.parametrize("temperature", [0.5, 3.0])
+def test_both_paths_draw_the_same_candidates(temperature):
+    policy = make_policy(exploration_temperature=temperature)
+    fast, plain = both_paths(policy, states(8))
+    np.testing.assert_allclose(fast, plain, atol=2e-5)
+    policy.exploration_temperature = 0.0
+    best, _ = both_paths(policy, states(8))
+    assert not np.allclose(fast, best, atol=1e-3)
 
 
 @pytest.mark.parametrize(("state_unit", "reward_unit"), [(1.0, 1e-9), (1e-6, 1.0), (0.0, 1.0), (1.0, 0.0)])

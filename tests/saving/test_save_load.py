@@ -205,6 +205,7 @@ ARGUMENTS = {
     "bound_penalty": 0.2,
     "pessimism": 0.3,
     "exploration_optimism": 0.4,
+    "exploration_temperature": 0.7,
     "target_policy_noise": 0.15,
     "target_noise_clip": 0.4,
     "policy_delay": 4,
