@@ -39,8 +39,8 @@ def act(policy: Policy, observation: PyTorchObs, deterministic: bool) -> th.Tens
         assert isinstance(observation, th.Tensor)
         noise = candidate_noise(policy, len(observation), deterministic).cpu().numpy()
         of_choice = choice_noise(policy, len(observation), deterministic)
-        drawn = (noise, None if of_choice is None else of_choice.cpu().numpy())
-        actions = acting(policy, observation.float().flatten(1).cpu().numpy(), *drawn, deterministic, policy.is_guided)
+        draws = (noise, None if of_choice is None else of_choice.cpu().numpy())
+        actions = acting(policy, observation.float().flatten(1).cpu().numpy(), *draws, deterministic, policy.is_guided)
         return th.as_tensor(actions, device=observation.device)
     with th.no_grad():
         actor = policy.acting_actor(deterministic)
