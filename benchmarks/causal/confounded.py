@@ -12,9 +12,9 @@ and without it (``causalgdp_sees_all``). One line for each evaluation of ten epi
 """
 
 import argparse
-import csv
 import functools
-from collections.abc import Callable, Iterator, Sequence
+import json
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,8 +22,10 @@ import gymnasium as gym
 import numpy as np
 from stable_baselines3.common.env_util import make_vec_env
 
+from benchmarks.causal.relevance import append
 from benchmarks.offline.data import FIELDS, ensure_dataset, environment_id, transitions
 from benchmarks.offline.methods import D3RLPY_METHODS, D3rlpyLearner, study_arguments
+from benchmarks.offline.study import SELECTION_SEED, returns_of
 from sb3_causalgdp import CausalGDP
 from sb3_causalgdp.offline.make import MAZE_TASKS
 from sb3_causalgdp.stress import ConfoundedBehaviour, LastAction, Nuisance
@@ -98,20 +100,16 @@ def without_last_columns(data: Data, n: int) -> Data:
     return {name: values[:, : values.shape[1] - n] if name in seen else values for name, values in data.items()}
 
 
-def data_of(task: str, kind: str, n_steps: int) -> Data:
+def seen_of(recorded: Data, task: str, kind: str) -> Data:
     """
+    :param recorded: By :func:`record`, or :func:`from_maze`
     :param task: A maze, or a MuJoCo task
     :param kind: One of ``KINDS``
-    :param n_steps: Number of transitions
     :return: The transitions that are learned from
     """
-    if task in MAZE_TASKS:
-        data = from_maze(task, n_steps)
-    else:
-        data = record(task, n_steps)
-        if kind == "nuisance":
-            return data
-        data = without_last_columns(data, data["actions"].shape[1])
+    if kind == "nuisance":
+        return recorded
+    data = recorded if task in MAZE_TASKS else without_last_columns(recorded, recorded["actions"].shape[1])
     return with_last_actions(data) if kind == "last_action" else data
 
 
@@ -132,23 +130,6 @@ def make_env(task: str, kind: str, mode: str = "changed") -> gym.Env:
         assert isinstance(env.action_space, gym.spaces.Box)
         return Nuisance(env, mode=mode, n=env.action_space.shape[0], coefficient=COEFFICIENT)
     return env
-
-
-def returns_of(predict: Callable[[np.ndarray], np.ndarray], make: Callable[[], gym.Env], n_episodes: int) -> np.ndarray:
-    """
-    :param predict: Actions for a batch of observations
-    :param make: Makes the task
-    :param n_episodes: Number of episodes, which are played side by side
-    :return: Their returns
-    """
-    env = make_vec_env(make, n_envs=n_episodes, seed=10_000)
-    observations, total, running = env.reset(), np.zeros(n_episodes), np.ones(n_episodes, dtype=bool)
-    while running.any():
-        observations, rewards, dones, _ = env.step(predict(np.asarray(observations)))
-        total += np.where(running, rewards, 0.0)
-        running &= ~dones
-    env.close()
-    return total
 
 
 # Learning ---------------------------------------------------------------------------------------------------------------
@@ -178,8 +159,6 @@ def learn(method: str, arguments: argparse.Namespace, kind: str, seed: int, data
 
 
 def make_parser() -> argparse.ArgumentParser:
-    import json
-
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--task", default="HalfCheetah-v5", help="HalfCheetah-v5, Hopper-v5, Walker2d-v5 or a maze")
     parser.add_argument("--kinds", nargs="+", choices=KINDS, default=list(KINDS))
@@ -196,30 +175,19 @@ def make_parser() -> argparse.ArgumentParser:
 
 def main(argv: Sequence[str] | None = None) -> None:
     arguments = make_parser().parse_args(argv)
+    recorded = (from_maze if arguments.task in MAZE_TASKS else record)(arguments.task, arguments.transitions)
     for kind in arguments.kinds:
-        data = data_of(arguments.task, kind, arguments.transitions)
+        data = seen_of(recorded, arguments.task, kind)
+        env = make_vec_env(functools.partial(make_env, arguments.task, kind), n_envs=arguments.episodes)
         for seed in arguments.seeds:
             for method in arguments.methods:
                 for n_updates, predict, hidden in learn(method, arguments, kind, seed, data):
-                    returns = returns_of(predict, functools.partial(make_env, arguments.task, kind), arguments.episodes)
+                    returns = returns_of(predict, env, SELECTION_SEED)
                     row = {"task": arguments.task, "kind": kind, "method": method, "seed": seed, "updates": n_updates}
                     row |= {"return": round(returns.mean(), 1), "std": round(returns.std(), 1), "hidden": hidden}
                     print(*(f"{name} {value}" for name, value in row.items()), flush=True)
                     if arguments.output is not None:
                         append(arguments.output, row)
-
-
-def append(path: Path, row: dict[str, Any]) -> None:
-    """
-    :param path: A CSV file, made if it is not there
-    :param row: A line of it
-    """
-    is_new = not path.exists()
-    with path.open("a", newline="") as stream:
-        writer = csv.DictWriter(stream, list(row), lineterminator="\n")
-        if is_new:
-            writer.writeheader()
-        writer.writerow(row)
 
 
 if __name__ == "__main__":

@@ -120,6 +120,19 @@ def run(arguments: argparse.Namespace, behaviour: str, seed: int) -> dict[str, A
     }
 
 
+def append(path: Path, record: dict[str, Any]) -> None:
+    """
+    :param path: A CSV file, made if it is not there
+    :param record: A line of it
+    """
+    is_new = not path.exists()
+    with path.open("a", newline="") as stream:
+        writer = csv.DictWriter(stream, list(record), lineterminator="\n")
+        if is_new:
+            writer.writeheader()
+        writer.writerow(record)
+
+
 def main(argv: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--env", default="HalfCheetah-v5")
@@ -137,12 +150,7 @@ def main(argv: Sequence[str] | None = None) -> None:
             record = run(arguments, behaviour, seed)
             print(*(f"{key} {value}" for key, value in record.items() if key != "withheld"), flush=True)
             if arguments.output is not None:
-                is_new = not arguments.output.exists()
-                with arguments.output.open("a", newline="") as stream:
-                    writer = csv.DictWriter(stream, list(record), lineterminator="\n")
-                    if is_new:
-                        writer.writeheader()
-                    writer.writerow(record)
+                append(arguments.output, record)
 
 
 if __name__ == "__main__":

@@ -2,13 +2,14 @@
 
 import json
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import torch as th
-from stable_baselines3.common.vec_env import DummyVecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 import sb3_causalgdp.offline  # noqa: F401 (registers the environments)
 from benchmarks.offline.data import ensure_dataset, environment_id
@@ -19,6 +20,23 @@ from sb3_causalgdp.offline.scores import normalized_score
 # Episode i starts from the seed SELECTION_SEED + i while training and from TEST_SEED + i in the end, for all methods and seeds
 SELECTION_SEED = 10_000
 TEST_SEED = 20_000
+
+
+def returns_of(predict: Callable[[np.ndarray], np.ndarray], envs: VecEnv, seed: int) -> np.ndarray:
+    """
+    :param predict: Actions for a batch of observations
+    :param envs: An environment for each episode
+    :param seed: Seed of the first episode's start; the others have the next ones
+    :return: Undiscounted return of each episode
+    """
+    envs.seed(seed)
+    observations = envs.reset()
+    returns, running = np.zeros(envs.num_envs), np.ones(envs.num_envs, dtype=bool)
+    while running.any():
+        observations, rewards, dones, _ = envs.step(predict(observations))  # type: ignore[arg-type]
+        returns += rewards * running
+        running &= ~dones
+    return returns
 
 
 class Evaluation:
@@ -40,14 +58,7 @@ class Evaluation:
         :param learner: A trained method
         :return: Undiscounted return of each episode
         """
-        self.envs.seed(self.seed)
-        observations = self.envs.reset()
-        returns, running = np.zeros(self.envs.num_envs), np.ones(self.envs.num_envs, dtype=bool)
-        while running.any():
-            observations, rewards, dones, _ = self.envs.step(learner.predict(observations))  # type: ignore[arg-type]
-            returns += rewards * running
-            running &= ~dones
-        return returns
+        return returns_of(learner.predict, self.envs, self.seed)
 
     def row(self, learner: Learner, checkpoint: str, n_updates: int, seconds: float) -> dict[str, Any]:
         """

@@ -8,6 +8,8 @@ covered is left to the plain path, see :meth:`NumpyActing.covers`.
 """
 
 import copy
+from collections.abc import Callable
+from functools import wraps
 from typing import Any
 
 import numpy as np
@@ -91,6 +93,19 @@ class _Views:
         return type(None), ()
 
 
+def _on_one_thread(act: Callable[..., np.ndarray]) -> Callable[..., np.ndarray]:
+    """On products this small, several threads of numpy's library mostly wait for each other: ten times the time."""
+
+    @wraps(act)
+    def limited(self: "NumpyActing", *args: Any) -> np.ndarray:
+        if all(library.num_threads == 1 for library in self._blas.lib_controllers):
+            return act(self, *args)
+        with self._blas.limit(limits=1):
+            return act(self, *args)
+
+    return limited
+
+
 class NumpyActing(_Views):
     """
     What :func:`sb3_causalgdp.prediction.act` computes, for few rows.
@@ -151,6 +166,7 @@ class NumpyActing(_Views):
             and (rule is None or not rule.needs_jacobian)
         )
 
+    @_on_one_thread
     def __call__(
         self,
         policy: Policy,
@@ -171,21 +187,6 @@ class NumpyActing(_Views):
         """
         if self._copy is not None:
             self._copy.refresh()
-        # On products this small, several threads of numpy's library mostly wait for each other: ten times the time
-        if all(library.num_threads == 1 for library in self._blas.lib_controllers):
-            return self._act(policy, state, noise, of_choice, deterministic, guided)
-        with self._blas.limit(limits=1):
-            return self._act(policy, state, noise, of_choice, deterministic, guided)
-
-    def _act(
-        self,
-        policy: Policy,
-        state: np.ndarray,
-        noise: np.ndarray,
-        of_choice: np.ndarray | None,
-        deterministic: bool,
-        guided: bool,
-    ) -> np.ndarray:
         denoiser, optimism = self.denoisers[bool(deterministic and policy.use_ema)], policy.acting_optimism(deterministic)
         n_candidates = policy.n_action_candidates
         features = self.features(state.T)

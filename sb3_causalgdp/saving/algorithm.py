@@ -42,7 +42,6 @@ FIRST_VALUES: dict[str, Any] = {
     "pessimism": 1.0,
     "causal_abstraction": False,
     "exploration_optimism": -1.0,
-    "exploration_temperature": 0.0,
 }
 
 
