@@ -120,6 +120,21 @@ class LayerNorm:
         return centred * inverse_std, inverse_std
 
 
+class SlopeAndOffset(NamedTuple):
+    """What a batch normalisation does to each row of its input, shape ``(rows, 1)`` each."""
+
+    slope: np.ndarray
+    offset: np.ndarray
+
+    def __call__(self, values: np.ndarray) -> np.ndarray:
+        mapped = values * self.slope
+        mapped += self.offset
+        return mapped
+
+    def of(self, rows: slice) -> "SlopeAndOffset":
+        return SlopeAndOffset(self.slope[rows], self.offset[rows])
+
+
 class BatchNorm:
     """``nn.BatchNorm1d`` of columns, by its running averages."""
 
@@ -129,8 +144,9 @@ class BatchNorm:
         self.weight, self.bias, self.mean, self.variance = (view(array)[:, None] for array in arrays)
         self.epsilon = np.float32(module.eps)
 
-    def scale(self) -> np.ndarray:
-        return self.weight / np.sqrt(self.variance + self.epsilon)
+    def now(self) -> "SlopeAndOffset":
+        slope = self.weight / np.sqrt(self.variance + self.epsilon)
+        return SlopeAndOffset(slope, self.bias - self.mean * slope)
 
 
 def without_batch_norms(network: nn.Sequential) -> tuple[list[nn.Module], list[nn.BatchNorm1d]]:

@@ -15,6 +15,7 @@ from sb3_causalgdp.acceleration.numpy_layers import (
     BatchNorm,
     Layer,
     LayerNorm,
+    SlopeAndOffset,
     clip,
     constant,
     layer_of,
@@ -214,11 +215,16 @@ class _Critic:
 
     def values(self, features: np.ndarray, actions: np.ndarray, n_candidates: int) -> np.ndarray:
         """Q of several actions for each features; the features' part of the first layer is computed once."""
-        (weight, bias), *layers = self._layers()
-        hidden = np.repeat(weight[:, : len(features)] @ features + bias, n_candidates, axis=1)
-        hidden += weight[:, len(features) :] @ actions
-        for norm, (next_weight, next_bias) in zip(self.norms, layers, strict=True):
-            hidden = next_weight.dot(self._hidden(norm, hidden).output)
+        (weight, bias), *layers = self.layers
+        first_norm, *batch_norms = self._batch_norms_now()
+        n_features = len(features)
+        if first_norm is not None:
+            features, actions = first_norm.of(slice(n_features))(features), first_norm.of(slice(n_features, None))(actions)
+        hidden = np.repeat(weight[:, :n_features] @ features + bias, n_candidates, axis=1)
+        hidden += weight[:, n_features:] @ actions
+        for norm, batch_norm, (next_weight, next_bias) in zip(self.norms, batch_norms, layers, strict=True):
+            output = self._hidden(norm, hidden).output
+            hidden = next_weight.dot(output if batch_norm is None else batch_norm(output))
             hidden += next_bias
         return self.value_of(hidden)
 
@@ -232,24 +238,19 @@ class _Critic:
 
     def forward(self, inputs: np.ndarray) -> tuple[np.ndarray, list[_Hidden]]:
         """The outputs, and the hidden layers."""
-        hidden = []
-        *layers, (last_weight, last_bias) = self._layers()
-        for norm, (weight, bias) in zip(self.norms, layers, strict=True):
-            product = weight.dot(inputs)
+        hidden: list[_Hidden] = []
+        product = inputs
+        for index, (batch_norm, (weight, bias)) in enumerate(zip(self._batch_norms_now(), self.layers, strict=True)):
+            if index > 0:
+                hidden.append(self._hidden(self.norms[index - 1], product))
+                inputs = hidden[-1].output
+            product = weight.dot(inputs if batch_norm is None else batch_norm(inputs))
             product += bias
-            hidden.append(self._hidden(norm, product))
-            inputs = hidden[-1].output
-        return last_weight.dot(inputs) + last_bias, hidden
+        return product, hidden
 
-    def _layers(self) -> list[Layer]:
-        """With the batch normalisations, which are maps of one slope and offset for each input, in the layers behind them."""
-        if not self.batch_norms:
-            return self.layers
-        layers = []
-        for norm, (weight, bias) in zip(self.batch_norms, self.layers, strict=True):
-            scale = norm.scale()
-            layers.append((weight * scale.T, bias + weight.dot(norm.bias - norm.mean * scale)))
-        return layers
+    def _batch_norms_now(self) -> Sequence[SlopeAndOffset | None]:
+        """Of the input of each layer."""
+        return [norm.now() for norm in self.batch_norms] or [None] * len(self.layers)
 
     def _hidden(self, norm: LayerNorm | None, product: np.ndarray) -> _Hidden:
         normalised = product if norm is None else norm(product)
@@ -257,7 +258,8 @@ class _Critic:
 
     def backward(self, outputs: np.ndarray, hidden: list[_Hidden], n_states: int) -> np.ndarray:
         """Gradient of Q by the states, the first of the inputs."""
-        weights = [weight for weight, _ in self._layers()]
+        weights = [weight for weight, _ in self.layers]
+        slopes = [None if norm is None else norm.slope for norm in self._batch_norms_now()]
         weights[0] = weights[0][:, :n_states]
         gradient = weights[-1].T
         if self.n_kept < len(outputs):
@@ -265,10 +267,13 @@ class _Critic:
             gradient = weights[-1][smallest].mean(axis=0).T
         elif self.n_kept > 1:
             gradient = gradient.mean(axis=1, keepdims=True)
-        for weight, layer, norm in zip(weights[-2::-1], reversed(hidden), reversed(self.norms), strict=True):
+        for index in reversed(range(len(hidden))):
+            layer, norm, slope = hidden[index], self.norms[index], slopes[index + 1]
+            if slope is not None:
+                gradient = gradient * slope
             gradient = gradient * self.activation.derivative(layer.normalised, layer.output)
-            gradient = weight.T.dot(gradient if norm is None else norm.backward(gradient, layer.product))
-        return gradient
+            gradient = weights[index].T.dot(gradient if norm is None else norm.backward(gradient, layer.product))
+        return gradient if slopes[0] is None else gradient * slopes[0][:n_states]
 
 
 class Critics:
