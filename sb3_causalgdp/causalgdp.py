@@ -480,7 +480,6 @@ class CausalGDP(AskedAlgorithm, DistilledAlgorithm, CheckedAlgorithm):
         """
         updates, losses = self._updates, defaultdict(list)
         beside_critics = updates.beside_critics()
-        # The next actions are those at the end of the chain of the actor's moving average
         next_actions, for_critics = updates.bootstrap(replay_data)
         for plan, batch in dealt(plans, replay_data, one_step, next_actions, for_critics):
             of_step = updates.update_critics(batch.replay_data, batch.for_critics, plan.running_weight)

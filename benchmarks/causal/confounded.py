@@ -174,7 +174,10 @@ def make_parser() -> argparse.ArgumentParser:
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    arguments = make_parser().parse_args(argv)
+    parser = make_parser()
+    arguments = parser.parse_args(argv)
+    if arguments.task in MAZE_TASKS and "nuisance" in arguments.kinds:
+        parser.error(f"--kinds of a maze are {' and '.join(KINDS[:2])}: its data has no nuisance")
     recorded = (from_maze if arguments.task in MAZE_TASKS else record)(arguments.task, arguments.transitions)
     for kind in arguments.kinds:
         data = seen_of(recorded, arguments.task, kind)

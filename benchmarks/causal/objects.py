@@ -10,7 +10,6 @@ point touches it. FetchPush needs gymnasium-robotics. Both algorithms are Causal
 """
 
 import argparse
-import csv
 import sys
 import time
 from collections.abc import Sequence
@@ -19,6 +18,7 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+import pandas as pd
 from gymnasium import spaces
 from stable_baselines3 import HerReplayBuffer
 
@@ -149,10 +149,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     arguments = parser.parse_args(argv)
     records = [record for seed in arguments.seeds for share in arguments.shares for record in run(arguments, share, seed)]
     if arguments.output is not None:
-        with arguments.output.open("w", newline="") as stream:
-            writer = csv.DictWriter(stream, list(records[0]), lineterminator="\n")
-            writer.writeheader()
-            writer.writerows(records)
+        pd.DataFrame(records).to_csv(arguments.output, index=False)
 
 
 if __name__ == "__main__":

@@ -10,13 +10,13 @@ until all of them have followed, an edge being a mask above 0.5, and stay so. ``
 """
 
 import argparse
-import csv
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
+import pandas as pd
 
 from sb3_causalgdp.callbacks import CausalWorldModelCallback
 from sb3_causalgdp.causal import CausalGraph, TransitionVariables, make_discovery, make_statistics
@@ -162,10 +162,7 @@ def main(argv: Sequence[str] | None = None) -> None:
                 records.append({**about, **found})
                 print(*(f"{key} {value}" for key, value in records[-1].items()), flush=True)
     if arguments.output is not None:
-        with arguments.output.open("w", newline="") as stream:
-            writer = csv.DictWriter(stream, list(records[0]), lineterminator="\n")
-            writer.writeheader()
-            writer.writerows(records)
+        pd.DataFrame(records).to_csv(arguments.output, index=False)
 
 
 if __name__ == "__main__":

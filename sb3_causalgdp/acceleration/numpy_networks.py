@@ -13,7 +13,6 @@ from sb3_causalgdp.acceleration.numpy_layers import (
     ONE,
     ROUNDING,
     BatchNorm,
-    Layer,
     LayerNorm,
     SlopeAndOffset,
     clip,
