@@ -4,14 +4,18 @@ import importlib.util
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import yaml
 
+from sb3_causalgdp.causal import CausalGraph, TransitionVariables
+from sb3_causalgdp.causal.discovery import FullyConnected, register_discovery_method
 from sb3_causalgdp.presets import PRESETS, preset
 
 PEERS = ("sac", "td3", "tqc", "crossq")
 VARIANTS: dict[str, dict[str, Any]] = {
     "causalgdp": {},
     "causalgdp_sees_all": {"causal_abstraction": False},
+    "causalgdp_true": {"causal_discovery": "distracted_truth"},
     "causalgdp_open": {"causal_discovery": "fully_connected"},
     "causalgdp_perturbed": {
         "causal_discovery": "perturbed",
@@ -20,6 +24,33 @@ VARIANTS: dict[str, dict[str, Any]] = {
     **{name: preset(name) for name in PRESETS},
 }
 NAMES = (*VARIANTS, *PEERS)
+
+
+class DistractedTruth(FullyConnected):
+    """
+    The graph that an oracle knows of ``Distracted/<task>``: a distracting observation depends on its own past alone, an idle
+    action moves nothing, and of the task itself, everything may move everything.
+    """
+
+    ADDED = ("noise ", "idle ")
+
+    def __call__(self, statistics: Any, variables: TransitionVariables, previous: CausalGraph | None = None) -> CausalGraph:
+        """
+        :param statistics: Only the number of rows is read
+        :param variables: Names and order of the variables
+        :param previous: Not used
+        :return: The graph
+        """
+        graph = super().__call__(statistics, variables)
+        own = np.array([not name.startswith(self.ADDED) for name in (*variables.state_names, *variables.action_names)])
+        effects = np.append(own[: variables.n_states], True)
+        graph.masks[:] = np.outer(effects, own)
+        np.fill_diagonal(graph.masks[:-1, : variables.n_states], 1.0)
+        graph.method = "distracted_truth"
+        return graph
+
+
+register_discovery_method("distracted_truth", DistractedTruth)
 
 
 def make_model(algorithm: str, env: Any, seed: int, **arguments: Any) -> Any:
@@ -35,7 +66,6 @@ def make_model(algorithm: str, env: Any, seed: int, **arguments: Any) -> Any:
     settings = dict(VARIANTS[algorithm]) if own else zoo_settings(algorithm, env.get_attr("spec")[0].id)
     noise_std = settings.pop("noise_std", None)
     if settings.pop("noise_type", None) == "normal":
-        import numpy as np
         from stable_baselines3.common.noise import NormalActionNoise
 
         n_actions = env.action_space.shape[0]
