@@ -75,6 +75,25 @@ def q_values(critic: "Critic", features: th.Tensor, actions: th.Tensor, networks
     return [critic.value_of(outputs) for outputs in network_outputs(critic, features, actions, networks)]
 
 
+@contextmanager
+def weights_fixed(network: nn.Module) -> Iterator[None]:
+    """
+    What is computed within is differentiated by its inputs alone. Where no gradient by the weights is asked for, PyTorch's own
+    layers leave it out, but a function that is written in Python, as our linear layers are, cannot know.
+
+    :param network: The network
+    """
+    # A compiled graph has nothing in it that is not asked for
+    trained = [] if th.compiler.is_compiling() else [one for one in network.parameters() if one.requires_grad]
+    try:
+        for parameter in trained:
+            parameter.requires_grad_(False)
+        yield
+    finally:
+        for parameter in trained:
+            parameter.requires_grad_(True)
+
+
 def smallest_q(critic: "Critic", features: th.Tensor, actions: th.Tensor) -> th.Tensor:
     """
     :param critic: The critics

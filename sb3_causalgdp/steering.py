@@ -13,7 +13,7 @@ from sb3_causalgdp.causal import CausalGuidance, LinearisedGuidance, MaskedWorld
 from sb3_causalgdp.causal.guidance import GUIDANCE_TARGETS
 from sb3_causalgdp.diffusion import GuidanceRule
 from sb3_causalgdp.extractors import StandardizedExtractor
-from sb3_causalgdp.networks import Critic, DiffusionActor, q_values
+from sb3_causalgdp.networks import Critic, DiffusionActor, q_values, weights_fixed
 from sb3_causalgdp.saving.policies import SavedPolicy
 
 
@@ -107,7 +107,7 @@ class SteeredPolicy(SavedPolicy):
         :return: Shape ``(batch, n)``, without a graph
         """
         networks = slice(None) if critic is None else slice(critic, critic + 1)
-        with th.enable_grad():
+        with th.enable_grad(), weights_fixed(self.critic_target):
             state = state.detach().requires_grad_()
             features = state if self.has_image_state else self._features_of_state(state, self.critic_target.features_extractor)
             values = q_values(self.critic_target, features, action, networks)

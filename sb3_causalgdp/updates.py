@@ -29,7 +29,7 @@ from sb3_causalgdp.losses import (
     trust_region_loss,
     world_model_loss,
 )
-from sb3_causalgdp.networks import network_outputs, q_values, smallest_q
+from sb3_causalgdp.networks import network_outputs, q_values, smallest_q, weights_fixed
 from sb3_causalgdp.step_plans import StepPlan
 
 Model = Any  # a CausalGDP, whose file imports this one
@@ -340,7 +340,7 @@ class Updates:
         observations = transitions.next_observations
         with th.no_grad():
             features = self.critic.extract_features(observations, self.critic.features_extractor)
-        with th.enable_grad():
+        with th.enable_grad(), weights_fixed(self.critic):
             actions = next_actions.detach().requires_grad_()
             (values,) = q_values(self.critic, features, actions, slice(climbed, climbed + 1))
             (gradient,) = th.autograd.grad(values.sum(), actions)
@@ -366,7 +366,8 @@ class Updates:
             (others,) = q_values(self.critic, features, actions, other_network)
             if self.model.q_scale == "advantage":
                 (replayed,) = q_values(self.critic, features, of_data, other_network)
-        (values,) = q_values(self.critic, features, actions, climbed_network)
+        with weights_fixed(self.critic):
+            (values,) = q_values(self.critic, features, actions, climbed_network)
         return q_loss(values, others, replayed)
 
     # Optimizers and averages ----------------------------------------------------------------------------------------------
