@@ -3,7 +3,7 @@ Learning under distraction: returns with more and more observations that do not 
 
     python benchmarks/causal/distraction.py --noises 0 20 100 300 --algorithms causalgdp causalgdp_sees_all sac tqc
     python benchmarks/causal/distraction.py --idle-actions 0 6 20 --steps 50000
-    python benchmarks/causal/distraction.py --noises 100 --algorithms causalgdp causalgdp_true causalgdp_open causalgdp_perturbed
+    python benchmarks/causal/distraction.py --noises 100 --algorithms causalgdp causalgdp_{true,open,perturbed}
     python benchmarks/causal/distraction.py --noises 100 --name patient --kwargs '{"causal_abstraction": {"patience": 5}}'
     python benchmarks/causal/distraction.py --noises 20 100 --print-queue > queue.txt
 

@@ -3,6 +3,7 @@ Draw the learning curves that ``run.py`` wrote, against steps and against CPU se
 
     python benchmarks/learning/summary.py --env HalfCheetah-v5 Hopper-v5 --steps 100000
     python benchmarks/learning/summary.py --env Hopper-v5 --steps 100000 --names causalgdp tqc --against tqc
+    python benchmarks/learning/summary.py --env Hopper-v5 --at 10000 20000 40000 60000 80000 100000
 
 The statistics are those of Agarwal et al. (2021, https://arxiv.org/abs/2108.13264): the interquartile mean over seeds, 95 %
 intervals by stratified bootstrap (``scipy.stats.bootstrap``: the authors' own package does not import beside pandas 3), and
@@ -55,13 +56,26 @@ def read(folder: Path, env_id: str, steps: int | None = None, names: Sequence[st
     :param names: Of the algorithms and variants, None for all
     :return: By name
     """
+    tables = tables_of(folder, env_id, names)
+    for name, by_seed in tables.items():
+        tables[name] = {seed: one for seed, one in by_seed.items() if steps is None or one["timesteps"][-1] >= steps}
+    return {name: _curves(by_seed, steps) for name, by_seed in tables.items() if by_seed}
+
+
+def tables_of(folder: Path, env_id: str, names: Sequence[str] | None = None) -> dict[str, dict[int, np.ndarray]]:
+    """
+    :param folder: Of the results
+    :param env_id: The environment
+    :param names: Of the algorithms and variants, None for all
+    :return: What was written, by name and seed
+    """
     tables: dict[str, dict[int, np.ndarray]] = {}
     for path in sorted(folder.glob(f"{env_id}_*.csv")):
         name, seed = path.stem.removeprefix(f"{env_id}_").rsplit("_", 1)
         table = np.atleast_1d(np.genfromtxt(path, delimiter=",", names=True))
-        if (names is None or name in names) and len(table) > 0 and (steps is None or table["timesteps"][-1] >= steps):
+        if (names is None or name in names) and len(table) > 0:
             tables.setdefault(name, {})[int(seed)] = table
-    return {name: _curves(by_seed, steps) for name, by_seed in tables.items()}
+    return tables
 
 
 def _curves(tables: Mapping[int, np.ndarray], steps: int | None) -> Curves:
@@ -131,6 +145,17 @@ def table(results: Mapping[str, Curves], against: str | None = None, level: floa
     return "\n".join("| " + " | ".join(row) + " |" for row in rows)
 
 
+def table_of_seeds(tables: Mapping[str, Mapping[int, np.ndarray]], at: Sequence[int]) -> str:
+    """A table in Markdown of what each seed had reached after some steps, blank where it was not evaluated."""
+    rows = [["", "seed", *(f"{step:,}" for step in at), "CPU seconds"], ["---"] * (len(at) + 3)]
+    for name, by_seed in tables.items():
+        for seed, table in sorted(by_seed.items()):
+            reached = dict(zip(table["timesteps"], table["mean_return"], strict=True))
+            cells = [f"{reached[step]:.0f}" if step in reached else "" for step in at]
+            rows.append([name, str(seed), *cells, f"{table['cpu_seconds'][-1]:.0f}"])
+    return "\n".join("| " + " | ".join(row) + " |" for row in rows)
+
+
 def draw(env_id: str, results: Mapping[str, Curves], path: Path) -> None:
     """Interquartile means and their intervals."""
     figure = Figure(figsize=(11, 4.2), layout="constrained")
@@ -159,8 +184,15 @@ def main() -> None:
     parser.add_argument("--against", help="print the probability of doing better than this one")
     parser.add_argument("--level", type=float, help="print the CPU seconds to this return")
     parser.add_argument("--folder", type=Path, default=RESULTS)
+    parser.add_argument(
+        "--at", nargs="+", type=int, help="print what each seed had reached after these steps, and draw nothing"
+    )
     arguments = parser.parse_args()
     for env_id in arguments.env:
+        if arguments.at:
+            tables = tables_of(arguments.folder, env_id, arguments.names)
+            print(f"\n{env_id}\n\n{table_of_seeds(tables, arguments.at)}")
+            continue
         results = read(arguments.folder, env_id, arguments.steps, arguments.names)
         if not results:
             raise SystemExit(f"No results of {env_id} in {arguments.folder}: run run.py first")

@@ -58,3 +58,10 @@ def test_the_table_and_the_figure_show_every_algorithm(tmp_path):
     assert "CPU seconds to" not in summary.table(results) and "better" not in summary.table(results)
     summary.draw("Env-v5", results, tmp_path / "figure.png")
     assert (tmp_path / "figure.png").stat().st_size > 10_000
+
+
+def test_what_each_seed_reached_is_blank_where_it_was_not_evaluated(tmp_path):
+    write(tmp_path, "own", 0, [1.0, 5.4, 4.0])
+    write(tmp_path, "own", 1, [1.0])
+    rows = summary.table_of_seeds(summary.tables_of(tmp_path, "Env-v5"), [20, 30]).splitlines()
+    assert rows[2:] == ["| own | 0 | 5 | 4 | 5 |", "| own | 1 |  |  | 1 |"]
