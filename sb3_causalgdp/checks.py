@@ -87,7 +87,10 @@ def register(registry: MutableMapping[str, Any], name: str, entry: Any, what: st
     :param entry: What it stands for
     :param what: What the table's entries are called
     :raises ValueError: If the name stands for something else already, or is no identifier
+    :raises TypeError: If the entry cannot be called
     """
+    if not callable(entry):
+        raise TypeError(f"{what} must be a class or a function, got {entry!r}")
     if not (isinstance(name, str) and name.isidentifier()):
         raise ValueError(f"name must be an identifier such as 'my_{what.replace(' ', '_')}', got {name!r}")
     if registry.get(name, entry) is not entry:

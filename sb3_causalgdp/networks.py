@@ -16,6 +16,7 @@ from torch import nn
 from sb3_causalgdp.acceleration.activations import fast
 from sb3_causalgdp.acceleration.products import make_layers_fast
 from sb3_causalgdp.diffusion import Guidance, GuidanceRule, NoiseSchedule, make_denoiser, sample
+from sb3_causalgdp.diffusion.plans import sampling_points
 from sb3_causalgdp.diffusion.samplers import bind, check_sampler
 from sb3_causalgdp.saving.policies import PickledAlone
 
@@ -331,6 +332,7 @@ class DiffusionActor(PickledAlone, BasePolicy):
         self.sampling_steps = sampling_steps
         self.denoiser_kwargs = denoiser_kwargs
         self.schedule = NoiseSchedule(noise_schedule, diffusion_steps)
+        sampling_points(self.schedule, sampling_steps)  # says what is wrong with the number of steps
         self.n_noises = diffusion_steps if sampling_steps is None else sampling_steps
         # A denoiser that is asked between its steps learns what is between them
         self.is_continuous = self.n_noises != diffusion_steps

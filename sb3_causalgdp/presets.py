@@ -96,26 +96,38 @@ def preset(name: str, offline: bool = False, guided: bool = False, **changes: An
     :param offline: Whether all settings are those of the method's paper, for a fixed dataset. By default only those are set
         that make the method, and the others are CausalGDP's own, for learning from an environment
     :param guided: Whether the causal guidance is plugged in
-    :param changes: Arguments of your own, which win; ``policy_kwargs`` one by one
+    :param changes: Arguments of your own, which win; ``policy_kwargs``, and ``denoiser_kwargs`` of one denoiser, key by key
     :return: Arguments of the constructor
-    :raises ValueError: If the name is unknown
+    :raises ValueError: If the name is unknown, or an argument is of another kind
     """
-    if name not in METHODS:
+    if not isinstance(name, str) or name not in METHODS:
         close = difflib.get_close_matches(str(name), PRESETS, n=1)
         hint = f", did you mean {close[0]!r}?" if close else ""
         raise ValueError(f"preset must be one of {list(PRESETS)}, got {name!r}{hint}")
+    for what, value in (("offline", offline), ("guided", guided)):
+        if not isinstance(value, bool):
+            raise ValueError(f"{what} must be True or False, got {value!r}")
     # What makes the method wins over the settings that it shares with others
     settings = OFFLINE[name] if offline else ONLINE.get(name, {})
     return _joined([settings, METHODS[name], NOT_ABSTRACTING, {} if guided else NOT_GUIDED, changes])
 
 
 def _joined(parts: list[Mapping[str, Any]]) -> dict[str, Any]:
-    """Later ones win; policy_kwargs are joined, and are copies."""
+    """Later ones win; policy_kwargs are joined, as are those of one denoiser, and are copies."""
     joined: dict[str, Any] = {}
     policy_kwargs: dict[str, Any] = {}
     for part in parts:
         joined.update(part)
-        policy_kwargs.update(part.get("policy_kwargs") or {})
+        own = part.get("policy_kwargs") or {}
+        if not isinstance(own, Mapping):
+            raise ValueError(f"policy_kwargs must be a dictionary or None, got {own!r}")
+        of_denoiser = dict(own.get("denoiser_kwargs") or {})
+        if own.get("denoiser", policy_kwargs.get("denoiser")) == policy_kwargs.get("denoiser"):
+            of_denoiser = {**policy_kwargs.get("denoiser_kwargs", {}), **of_denoiser}
+        policy_kwargs = {**policy_kwargs, **own}
+        policy_kwargs.pop("denoiser_kwargs", None)
+        if of_denoiser:
+            policy_kwargs["denoiser_kwargs"] = of_denoiser
     if policy_kwargs:
         joined["policy_kwargs"] = policy_kwargs
     return copy.deepcopy(joined)

@@ -286,7 +286,7 @@ def test_what_cannot_be_exported_is_refused_and_nothing_written(pendulum, tmp_pa
     with pytest.raises(ValueError, match=r"path must end in one of \['.onnx', '.pt', '.pt2'\], got 'policy.h5'"):
         pendulum.export("policy.h5")
     before = CausalGDP("MlpPolicy", "Pendulum-v1", **SMALL)
-    with pytest.raises(ValueError, match="guided must be False or None before the causal graph is found"):
+    with pytest.raises(ValueError, match="got True: no causal graph has been found yet"):
         before.export(tmp_path / "policy.pt", guided=True)
     stacked = VecFrameStack(VecNormalize(make_vec_env("Pendulum-v1")), 2)
     with pytest.raises(ValueError, match=r"shape \(3,\) are normalised, and the policy sees \(6,\).*vec_normalize=None"):
@@ -390,3 +390,35 @@ def test_a_file_runs_without_this_package(exported, pendulum, observations):
     subprocess.run([sys.executable, "-c", code], cwd=exported.parent, check=True, timeout=120)
     expected, _ = pendulum.predict(observations, deterministic=True)
     np.testing.assert_allclose(np.load(exported.with_name("actions.npy")), expected, atol=TOLERANCE)
+
+
+class FixesRows(nn.Module):
+    """A denoiser that takes the number of rows for a constant."""
+
+    def __init__(self, action_dim, condition_dim, n_steps, net_arch, activation_fn):
+        super().__init__()
+        self.network = nn.Linear(action_dim + condition_dim + 1, action_dim)
+
+    def forward(self, noisy_action, step, condition):
+        time = th.as_tensor(step, dtype=noisy_action.dtype).expand(len(noisy_action)).unsqueeze(1)
+        return self.network(th.cat([noisy_action, condition, time], dim=1))
+
+
+@pytest.mark.parametrize("denoiser", ["residual_mlp", "transformer"])
+def test_other_denoisers_are_exported_for_any_number_of_rows(denoiser, tmp_path):
+    arguments = {**SMALL, "policy_kwargs": {"net_arch": [16, 16], "denoiser": denoiser}}
+    model = CausalGDP("MlpPolicy", "Pendulum-v1", **arguments)
+    model.export(tmp_path / "policy.pt")
+    loaded = th.jit.load(tmp_path / "policy.pt")
+    for n_rows in (1, 5):
+        observations = np.random.default_rng(0).normal(size=(n_rows, 3)).astype(np.float32)
+        expected = model.predict(observations, deterministic=True)[0]
+        np.testing.assert_allclose(loaded(th.as_tensor(observations)).numpy(), expected, atol=TOLERANCE)
+
+
+@pytest.mark.parametrize("suffix", [".pt", ".pt2"])
+def test_a_denoiser_that_fixes_the_number_of_rows_is_not_exported(suffix, tmp_path):
+    model = CausalGDP("MlpPolicy", "Pendulum-v1", **{**SMALL, "policy_kwargs": {"denoiser": FixesRows}})
+    with pytest.raises(ValueError, match=r"fixes the number of rows: .* take x.shape\[0\]"):
+        model.export(tmp_path / f"policy{suffix}")
+    assert not any(tmp_path.iterdir())

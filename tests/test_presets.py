@@ -90,6 +90,27 @@ def test_what_makes_a_method_wins_over_its_papers_other_settings_and_the_users_o
     assert preset("edp_iql")["policy_kwargs"]["sampling_steps"] == 15
 
 
+def test_arguments_of_the_denoiser_are_joined_unless_it_is_another_one():
+    assert preset("attention", policy_kwargs={"denoiser_kwargs": {"n_heads": 2}})["policy_kwargs"]["denoiser_kwargs"] == {
+        "causal": True,
+        "n_heads": 2,
+    }
+    assert "denoiser_kwargs" not in preset("attention", policy_kwargs={"denoiser": "mlp"})["policy_kwargs"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"name": ["edp"]}, "preset must be one of"),
+        ({"name": "edp", "guided": "no"}, "guided must be True or False, got 'no'"),
+        ({"name": "edp", "policy_kwargs": "x"}, "policy_kwargs must be a dictionary or None, got 'x'"),
+    ],
+)
+def test_arguments_of_another_kind_are_refused(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        preset(**arguments)
+
+
 def test_guidance_is_off_unless_it_is_plugged_in():
     assert all(preset(name)["guidance"] is None and "guidance" not in preset(name, guided=True) for name in PRESETS)
     assert preset("edp", guidance="score")["guidance"] == "score"

@@ -186,7 +186,7 @@ class ResidualMLPDenoiser(nn.Module):
         :param condition: Features of the observation, shape ``(batch, condition_dim)``
         :return: Predicted noise, shape ``(batch, d)``
         """
-        time = at_step(self.time_table, step).expand(len(noisy_action), -1)
+        time = at_step(self.time_table, step).expand(noisy_action.shape[0], -1)
         hidden = self.input_layer(th.cat([noisy_action, time, condition], dim=1))
         for block in self.blocks:
             hidden = hidden + block(hidden)

@@ -1,7 +1,7 @@
 """What a guidance is, and how it enters a denoising step."""
 
 from collections.abc import Callable, Sequence
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import torch as th
@@ -161,12 +161,32 @@ def guidance_shift(
     """
     alpha_bar = schedule.signal_left(step).to(noisy_action.dtype)
     clean = (noisy_action - (1.0 - alpha_bar).sqrt() * noise) / alpha_bar.sqrt()
-    gradient, curvature = guidance(clean if clip is None else clean.clamp(-clip, clip))
+    at = clean if clip is None else clean.clamp(-clip, clip)
+    gradient, curvature = checked_answer(guidance(at), at)
     jacobian = None
     if rule.needs_jacobian:
         jacobian = clean_estimate_jacobian(predict_noise, noisy_action, step, alpha_bar, rule.differentiates_forwards)
     direction = rule(gradient, curvature, alpha_bar, jacobian)
     return rule.scale_at(step, alpha_bar) * (1.0 - alpha_bar).sqrt() * direction
+
+
+def checked_answer(answer: Any, actions: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+    """
+    :param answer: What a guidance says
+    :param actions: Of these, shape ``(batch, d)``
+    :return: Its gradient and curvature
+    :raises ValueError: If these are none, or of other shapes, which PyTorch would repeat
+    """
+    batch, width = actions.shape
+    parts = tuple(answer) if isinstance(answer, tuple | list) else (answer,)
+    shapes = [tuple(part.shape) if isinstance(part, th.Tensor) else type(part).__name__ for part in parts]
+    wanted = [(batch, width), (batch, width, width)]
+    if shapes != wanted:
+        raise ValueError(
+            f"guidance must give tensors, a gradient and a curvature of the shapes {wanted[0]} and {wanted[1]}, "
+            f"got {', '.join(map(str, shapes))}"
+        )
+    return parts[0], parts[1]
 
 
 def clean_estimate_jacobian(

@@ -6,10 +6,29 @@ from typing import Any, NamedTuple
 
 import torch as th
 
-from sb3_causalgdp.diffusion.guidance import Guidance, GuidanceRule
+from sb3_causalgdp.diffusion.guidance import Guidance, GuidanceRule, checked_answer
 
 # Share of signal below which the model's Jacobian says nothing of what the clean action is
 LEAST_SIGNAL = 1e-6
+# Whose samples are what ``noise_level`` says, by the tests: of the others, some count noise otherwise
+SUPPORTED = (
+    "DDPMScheduler",
+    "DDIMScheduler",
+    "DEISMultistepScheduler",
+    "DPMSolverMultistepScheduler",
+    "EulerAncestralDiscreteScheduler",
+    "EulerDiscreteScheduler",
+    "FlowMatchEulerDiscreteScheduler",
+    "FlowMatchHeunDiscreteScheduler",
+    "HeunDiscreteScheduler",
+    "KDPM2DiscreteScheduler",
+    "LCMScheduler",
+    "LMSDiscreteScheduler",
+    "PNDMScheduler",
+    "SASolverScheduler",
+    "TCDScheduler",
+    "UniPCMultistepScheduler",
+)
 
 
 class ActionUnits(NamedTuple):
@@ -115,7 +134,8 @@ class GuidedScheduler:
     where ``signal = 1 - spread``, by ``-spread / (1 - spread) * G``. In ``step``, what the network says is turned into the
     clean estimate, moved, and turned back, so that the scheduler's own method, clipping, history and noise stay as they are.
 
-    :param scheduler: DDPM, DDIM, DPM-Solver, Euler or flow-matching Euler, or one that is built like them
+    :param scheduler: One of ``diffusers`` that is in ``SUPPORTED``, such as DDPM, DDIM, DPM-Solver, Euler and flow-matching
+        Euler; or one of your own that counts noise like them
     :param guidance: Log density over actions of shape ``(batch, d)``, in the environment's units, None for none; it may be
         replaced before each chain, ``scheduler.guidance = ...``
     :param rule: How the guidance enters a step, :class:`GuidanceRule` with the covariance ``unit_gaussian`` if None
@@ -126,7 +146,8 @@ class GuidedScheduler:
     :param position: The action of a chunk that the guidance is about, counted along the horizon; None for the whole chunk,
         which the guidance then gets as one row of ``horizon * d`` components
     :param clip: Bound of the network's clean actions at which the guidance is evaluated, None for no bound
-    :raises ValueError: If the rule has more scales than one
+    :raises ValueError: If the rule has more scales than one, or a bound is not positive
+    :raises TypeError: If an argument is of another kind, or the scheduler one of ``diffusers`` that is not supported
     """
 
     def __init__(
@@ -140,12 +161,19 @@ class GuidedScheduler:
         position: int | None = None,
         clip: float | None = 1.0,
     ) -> None:
-        if not callable(getattr(scheduler, "step", None)) or not hasattr(scheduler, "config"):
-            raise TypeError(f"scheduler must be an object of diffusers, like DDIMScheduler(), got {scheduler!r}")
-        if guidance is not None and not callable(guidance):
-            raise TypeError(f"guidance must be a function of actions or None, got {guidance!r}")
+        _check_scheduler(scheduler)
+        functions: dict[str, Any] = {"guidance": guidance, "model": model}
+        for what, value in functions.items():
+            if value is not None and not callable(value):
+                raise TypeError(f"{what} must be a function or None, got {value!r}")
+        objects: dict[str, tuple[Any, type]] = {"rule": (rule, GuidanceRule), "units": (units, ActionUnits)}
+        for what, (value, kind) in objects.items():
+            if value is not None and not isinstance(value, kind):
+                raise TypeError(f"{what} must be of the class {kind.__name__} or None, got {value!r}")
         if position is not None and (isinstance(position, bool) or not isinstance(position, Integral)):
             raise TypeError(f"position must be an integer or None, got {position!r}")
+        if clip is not None and not (isinstance(clip, int | float) and clip > 0.0):
+            raise ValueError(f"clip must be a positive number or None, got {clip!r}")
         self.scheduler = scheduler
         self.guidance = guidance
         self.rule = GuidanceRule() if rule is None else rule
@@ -285,13 +313,24 @@ class GuidedScheduler:
         """Gradient and curvature of the guidance by what it is about, in the network's units."""
         assert self.guidance is not None
         scale, offset = (th.as_tensor(value, dtype=clean.dtype, device=clean.device) for value in self.units)
+        self._check_shape(clean.shape, scale)
         factor, actions = scale.expand(clean.shape[1:]), scale * clean + offset
         if self._is_about_one(clean.shape):
             factor, actions = factor[self.position], actions[:, self.position]
         rows = actions.flatten(1)
-        gradient, curvature = _checked_answer(self.guidance(rows), tuple(rows.shape))
+        gradient, curvature = checked_answer(self.guidance(rows), rows)
+        if not bool(gradient.isfinite().all() & curvature.isfinite().all()):
+            whose = "guidance must give" if bool(rows.isfinite().all()) else "The network must predict"
+            raise ValueError(f"{whose} finite numbers, got NaN or infinite ones")
         factor = factor.flatten()
         return gradient * factor, curvature * factor[:, None] * factor
+
+    def _check_shape(self, shape: th.Size, scale: th.Tensor) -> None:
+        width = shape[-1]
+        if scale.ndim > 0 and scale.shape[-1] not in (1, width):
+            raise ValueError(f"units must be those of {width} action components, as samples have, got {scale.shape[-1]}")
+        if self._is_about_one(shape) and not -shape[1] <= int(self.position or 0) < shape[1]:
+            raise ValueError(f"position must be an index of a chunk of {shape[1]} actions, got {self.position}")
 
     def _of_all_actions(self, gradient: th.Tensor, curvature: th.Tensor, shape: th.Size) -> tuple[th.Tensor, th.Tensor]:
         """The same by all of a chunk, ``horizon * d`` components, of which most are 0 where it is about one action."""
@@ -328,13 +367,13 @@ class GuidedScheduler:
         return th.func.vmap(column)(identity).permute(1, 2, 0)
 
 
-def _checked_answer(answer: Any, shape: tuple[int, ...]) -> tuple[th.Tensor, th.Tensor]:
-    """What a guidance of one's own says of actions of this shape."""
-    batch, width = shape
-    shapes = [tuple(part.shape) for part in answer] if isinstance(answer, tuple | list) else [tuple(answer.shape)]
-    if shapes != [(batch, width), (batch, width, width)]:
-        raise ValueError(
-            f"guidance must give a gradient and a curvature of the shapes {(batch, width)} and {(batch, width, width)} for "
-            f"actions of the shape {shape}, got {', '.join(map(str, shapes))}"
+def _check_scheduler(scheduler: Any) -> None:
+    if isinstance(scheduler, GuidedScheduler):
+        raise TypeError("scheduler is guided already: set its guidance, or wrap its scheduler.scheduler")
+    if isinstance(scheduler, type) or not callable(getattr(scheduler, "step", None)) or not hasattr(scheduler, "config"):
+        raise TypeError(f"scheduler must be an object of diffusers, like DDIMScheduler(), got {scheduler!r}")
+    classes = type(scheduler).__mro__
+    if classes[0].__module__.startswith("diffusers.") and not any(one.__name__ in SUPPORTED for one in classes):
+        raise TypeError(
+            f"scheduler must be one of {list(SUPPORTED)}, which are known to be guided right, got {classes[0].__name__}"
         )
-    return answer[0], answer[1]

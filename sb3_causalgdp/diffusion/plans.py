@@ -86,7 +86,10 @@ def sampling_points(schedule: NoiseSchedule, n_steps: int | None = None, spacing
     :param n_steps: Number of times, None for the schedule's own
     :param spacing: ``time`` for evenly spaced diffusion steps, ``log_snr`` for evenly spaced logs of signal over noise
     :return: From the clean end to the noise end
+    :raises ValueError: If there are to be several, and the schedule has but one
     """
+    if schedule.n_steps == 1 and n_steps not in (None, 1):
+        raise ValueError(f"sampling_steps must be 1 or None for a schedule of one diffusion step, got {n_steps}")
     count, last = schedule.n_steps if n_steps is None else n_steps, schedule.n_steps - 1
     if spacing == "log_snr" and count > 1 and last > 0:
         low, high = schedule.log_snr_list[0], schedule.log_snr_list[-1]

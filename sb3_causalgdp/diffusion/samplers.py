@@ -161,7 +161,9 @@ def sample(
     rule = GuidanceRule() if rule is None else rule
     n_noises = schedule.n_steps if n_steps is None else n_steps
     if noise is None:
-        width = denoiser.action_dim if action_dim is None else action_dim  # type: ignore[attr-defined]
+        width = getattr(denoiser, "action_dim", None) if action_dim is None else action_dim
+        if width is None:
+            raise ValueError("action_dim must be given, or noise, for a denoiser without an attribute action_dim")
         noise = th.randn(n_noises, len(observation), width, dtype=observation.dtype, device=observation.device)
     if noise.ndim != 3 or noise.shape[:2] != (n_noises, observation.shape[0]):
         raise ValueError(f"noise must have the shape ({n_noises}, {len(observation)}, d), got {tuple(noise.shape)}")
@@ -174,6 +176,8 @@ def sample(
     for position, stage in enumerate(sampling_plan(schedule, sampler, eta, n_steps, spacing)):
         signal, spread = math.sqrt(stage.alpha_bar), math.sqrt(1.0 - stage.alpha_bar)
         predicted = predict_noise(action, stage.step)
+        if predicted.shape != action.shape:
+            raise ValueError(f"denoiser must predict noise of the shape {tuple(action.shape)}, got {tuple(predicted.shape)}")
         clean = (action - spread * predicted) / signal
         if guidance is not None:
             shift = guidance_shift(guidance, rule, predict_noise, schedule, action, predicted, stage.step, clip)

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import torch as th
@@ -99,6 +100,17 @@ def register_noise_schedule(name: str, betas: Callable[[int], th.Tensor]) -> Non
     register(NOISE_SCHEDULES, name, betas, "noise schedule")
 
 
+def _checked_betas(betas: Any, name: str, n_steps: int) -> th.Tensor:
+    """Of a function of one's own, too; double precision."""
+    betas = th.as_tensor(betas, dtype=th.float64)
+    if betas.shape != (n_steps,) or not bool(((betas > 0.0) & (betas < 1.0)).all()):
+        raise ValueError(
+            f"noise_schedule {name!r} must give {n_steps} betas between 0 and 1, got {betas.flatten().tolist()[:10]} "
+            f"of the shape {tuple(betas.shape)}"
+        )
+    return betas
+
+
 class NoiseSchedule(nn.Module):
     """
     The coefficients of the forward process ``a^k = sqrt(alpha_bar_k) a^0 + sqrt(1 - alpha_bar_k) eps``.
@@ -129,7 +141,7 @@ class NoiseSchedule(nn.Module):
             raise ValueError(f"diffusion_steps must be an integer of at least 1, got {n_steps!r}")
         self.name = name
         self.n_steps = int(n_steps)
-        betas = NOISE_SCHEDULES[name](n_steps)
+        betas = _checked_betas(NOISE_SCHEDULES[name](self.n_steps), name, self.n_steps)
         alpha_bar = th.cumprod(1.0 - betas, dim=0)
         alpha_bar_previous = th.cat([th.ones(1, dtype=th.float64), alpha_bar[:-1]])
         coefficients = {

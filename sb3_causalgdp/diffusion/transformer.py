@@ -133,7 +133,7 @@ class TransformerDenoiser(nn.Module):
         :return: Predicted noise, shape ``(batch, d)``
         """
         values = th.cat([condition, noisy_action], dim=1).unsqueeze(2)
-        time = self.time_layer(at_step(self.time_table, step)).expand(len(noisy_action), -1).unsqueeze(1)
+        time = self.time_layer(at_step(self.time_table, step)).expand(noisy_action.shape[0], -1).unsqueeze(1)
         tokens = th.cat([values * self.value_embedding + self.name_embedding, time], dim=1)
         bias = th.zeros_like(self.attention).masked_fill(self.attention == 0.0, -math.inf)
         for layer in self.layers:

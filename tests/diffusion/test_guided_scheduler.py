@@ -279,7 +279,14 @@ def test_cost_of_guidance_is_less_than_a_small_network():
     ("kwargs", "message"),
     [
         ({"scheduler": "ddim"}, "scheduler must be an object of diffusers"),
-        ({"guidance": 0.5}, "guidance must be a function of actions or None, got 0.5"),
+        ({"guidance": 0.5}, "guidance must be a function or None, got 0.5"),
+        ({"scheduler": diffusers.DDIMScheduler}, "scheduler must be an object of diffusers, like"),
+        ({"scheduler": diffusers.EDMEulerScheduler()}, "scheduler must be one of .*DDIMScheduler.*, got EDMEulerScheduler"),
+        ({"scheduler": diffusers.DDIMInverseScheduler()}, "known to be guided right, got DDIMInverseScheduler"),
+        ({"scheduler": GuidedScheduler(diffusers.DDIMScheduler())}, "guided already: set its guidance"),
+        ({"model": "x"}, "model must be a function or None, got 'x'"),
+        ({"rule": "posterior"}, "rule must be of the class GuidanceRule or None, got 'posterior'"),
+        ({"units": 2.0}, "units must be of the class ActionUnits or None, got 2.0"),
         ({"position": "first"}, "position must be an integer or None, got 'first'"),
     ],
 )
@@ -295,3 +302,36 @@ def test_a_guidance_that_answers_otherwise_is_told_what_is_wanted(answer):
     sample = th.randn(5, 2)
     with pytest.raises(ValueError, match=r"a gradient and a curvature of the shapes \(5, 2\) and \(5, 2, 2\)"):
         scheduler.step(th.zeros(5, 2), scheduler.timesteps[0], sample)
+
+
+@pytest.mark.parametrize("clip", [-1, 0.0, "1"])
+def test_a_bound_is_a_positive_number(clip):
+    with pytest.raises(ValueError, match="clip must be a positive number or None"):
+        GuidedScheduler(diffusers.DDIMScheduler(), clip=clip)
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "message"),
+    [
+        ({"position": 16}, "position must be an index of a chunk of 16 actions, got 16"),
+        (
+            {"units": ActionUnits(th.ones(3), th.zeros(3))},
+            "units must be those of 2 action components, as samples have, got 3",
+        ),
+        ({"guidance": lambda a: (a.numpy(), 1.0)}, r"\(5, 32\) and \(5, 32, 32\), got ndarray, float"),
+        ({"guidance": lambda a: (a * math.nan, a[:, :, None] * a[:, None])}, "guidance must give finite numbers, got NaN"),
+    ],
+)
+def test_what_does_not_fit_a_chunk_is_named_at_the_first_step(kwargs, message):
+    guidance = kwargs.pop("guidance", lambda a: (a, a[:, :, None] * a[:, None]))
+    scheduler = GuidedScheduler(diffusers.DDIMScheduler(), guidance, **kwargs)
+    scheduler.set_timesteps(4)
+    with pytest.raises(ValueError, match=message):
+        scheduler.step(th.zeros(5, 16, 2), scheduler.timesteps[0], th.randn(5, 16, 2))
+
+
+def test_a_network_that_predicts_nan_is_named():
+    scheduler = GuidedScheduler(diffusers.DDIMScheduler(), lambda a: (a, a[:, :, None] * a[:, None]))
+    scheduler.set_timesteps(4)
+    with pytest.raises(ValueError, match="The network must predict finite numbers"):
+        scheduler.step(th.full((5, 2), math.nan), scheduler.timesteps[0], th.randn(5, 2))

@@ -4,7 +4,7 @@ import pytest
 import torch as th
 
 from sb3_causalgdp.diffusion import MLPDenoiser, NoiseSchedule, sample
-from sb3_causalgdp.diffusion.plans import sampling_plan
+from sb3_causalgdp.diffusion.plans import SAMPLERS, sampling_plan
 from sb3_causalgdp.diffusion.samplers import denoising_step, transition_std
 
 STEPPING = {"timestep_spacing": "leading", "steps_offset": 0, "prediction_type": "epsilon"}
@@ -261,3 +261,27 @@ def test_an_unknown_sampler_is_refused():
 def test_a_noise_of_ddim_out_of_range_is_refused(eta):
     with pytest.raises(ValueError, match=r"ddim_eta must be in \[0, 1\]"):
         sample(wavy, NoiseSchedule("vp", 3), th.zeros(2, 2), action_dim=2, sampler="ddim", eta=eta)
+
+
+@pytest.mark.parametrize("sampler", list(SAMPLERS))
+def test_a_schedule_of_one_step_has_no_more(sampler):
+    with pytest.raises(ValueError, match="sampling_steps must be 1 or None for a schedule of one diffusion step, got 4"):
+        sampling_plan(NoiseSchedule("vp", 1), sampler, n_steps=4)
+
+
+@pytest.mark.parametrize(
+    "answer",
+    [lambda a: a, lambda a: (a, a[0, :, None] * a[0]), lambda a: (a, a), lambda a: (a[:1], a[:1, :, None] * a[:1, None])],
+)
+def test_a_guidance_of_other_shapes_is_refused(answer):
+    denoiser = lambda noisy, step, condition: noisy  # noqa: E731
+    with pytest.raises(ValueError, match=r"a gradient and a curvature of the shapes \(2, 2\) and \(2, 2, 2\), got"):
+        sample(denoiser, NoiseSchedule("vp", 4), th.zeros(2, 1), answer, action_dim=2)
+
+
+def test_a_denoiser_of_another_width_and_one_of_unknown_width_are_refused():
+    schedule, condition = NoiseSchedule("vp", 4), th.zeros(2, 1)
+    with pytest.raises(ValueError, match=r"denoiser must predict noise of the shape \(2, 2\), got \(2, 1\)"):
+        sample(lambda noisy, step, condition: noisy[:, :1], schedule, condition, action_dim=2)
+    with pytest.raises(ValueError, match="action_dim must be given, or noise"):
+        sample(lambda noisy, step, condition: noisy, schedule, condition)

@@ -1,9 +1,11 @@
 import math
 
+import numpy as np
 import pytest
 import torch as th
 
 from sb3_causalgdp.diffusion import NOISE_SCHEDULES, NoiseSchedule
+from sb3_causalgdp.diffusion.schedules import register_noise_schedule
 
 NAMES = sorted(NOISE_SCHEDULES)
 
@@ -104,3 +106,19 @@ def test_an_unknown_name_is_refused_with_the_known_ones():
 def test_a_number_of_steps_that_is_no_positive_integer_is_refused(n_steps):
     with pytest.raises(ValueError, match="integer of at least 1"):
         NoiseSchedule("vp", n_steps)
+
+
+@pytest.mark.parametrize(
+    "betas", [lambda n: th.linspace(0.5, 1.5, n), lambda n: th.full((n,), math.nan), lambda n: th.full((3,), 0.1)]
+)
+def test_betas_of_ones_own_are_checked(betas, monkeypatch):
+    monkeypatch.setitem(NOISE_SCHEDULES, "own", betas)
+    with pytest.raises(ValueError, match="noise_schedule 'own' must give 5 betas between 0 and 1, got"):
+        NoiseSchedule("own", 5)
+
+
+def test_betas_of_ones_own_may_be_an_array(monkeypatch):
+    monkeypatch.setitem(NOISE_SCHEDULES, "own", lambda n: np.full(n, 0.5, np.float32))
+    assert NoiseSchedule("own", 2).alpha_bar_list == [0.5, 0.25]
+    with pytest.raises(TypeError, match="noise schedule must be a class or a function, got 3"):
+        register_noise_schedule("another", 3)
