@@ -54,6 +54,7 @@ class DistilledAlgorithm(OfflineToOnlineAlgorithm):
         buffers = [buffer for buffer in (self.replay_buffer, self.offline_buffer) if buffer is not None]
         if sum(buffer.size() for buffer in buffers) == 0:
             raise ValueError("distil() needs transitions, got none: call learn(), preload() or load_replay_buffer()")
+        self._warn_if_untrained("distilled")
         own_env = self._env_to_visit(env)
         numpy_state, rows = np.random.get_state(), 500
         with th.random.fork_rng():

@@ -316,6 +316,13 @@ def test_a_distilled_policy_is_quicker(teacher):
     assert seconds(student) < 0.7 * seconds(teacher.policy)
 
 
+def test_distilling_before_learning_says_so():
+    model = CausalGDP("MlpPolicy", Aim(), **KWARGS)
+    model.learn(model.learning_starts - 1)
+    with pytest.warns(UserWarning, match="has not been trained: what is distilled is the policy that it started with"):
+        model.distil(n_observations=10, gradient_steps=1)
+
+
 def test_distilling_needs_a_policy_that_denoises_and_transitions(teacher):
     with pytest.raises(ValueError, match="needs transitions, got none"):
         CausalGDP("MlpPolicy", Aim()).distil()

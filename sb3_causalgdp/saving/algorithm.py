@@ -129,10 +129,13 @@ class SavedAlgorithm(DiscoveringAlgorithm):
         :raises ImportError: If a package for ONNX is missing
         :raises RuntimeError: If the file gives other actions than ``predict``
         """
-        if self._n_updates == 0 and self.world_model.n_batches == 0:
-            warnings.warn("The model has not been trained: what is exported is the policy that it started with.")
+        self._warn_if_untrained("exported")
         normalizer = self._vec_normalize_env if isinstance(vec_normalize, str) else vec_normalize
         export_policy(self.policy, path, self.transition_variables, guided, deterministic, normalizer)
+
+    def _warn_if_untrained(self, what: str) -> None:
+        if self._n_updates == 0 and self.world_model.n_batches == 0:
+            warnings.warn(f"The model has not been trained: what is {what} is the policy that it started with.", stacklevel=3)
 
     def save(
         self,
