@@ -7,6 +7,7 @@ import pytest
 import torch as th
 
 from sb3_causalgdp.diffusion import ActionUnits, GuidanceRule, GuidedScheduler
+from sb3_causalgdp.diffusion.guided_scheduler import SUPPORTED
 from tests.diffusion.test_guidance import DIM, LinearGaussian
 
 diffusers = pytest.importorskip("diffusers")
@@ -73,6 +74,22 @@ def test_guided_chain_ends_in_the_posterior_after_twenty_steps(name, kind, seed)
     ends = chain(guided, model, th.cat([start, -start]), generator)
     assert system.error(ends.mean(dim=0)) <= 0.05
     assert system.error(system.mean) > 0.1
+
+
+@pytest.mark.parametrize("name", SUPPORTED)
+def test_every_scheduler_that_is_not_refused_leads_a_normal_policy_to_the_posterior(name):
+    scheduler = getattr(diffusers, name)(1_000, **({"clip_sample": False} if name.startswith("DD") else {}))
+    scheduler.set_timesteps(20)
+    precision = 100.0 * th.eye(2)
+    guidance = lambda action: ((0.8 - action) @ precision, precision.expand(len(action), 2, 2))  # noqa: E731
+    guided = GuidedScheduler(scheduler, guidance, clip=None)
+    model = exact_model(guided, th.zeros(2), th.eye(2))
+    th.manual_seed(0)
+    sample = th.randn(2_000, 2) * getattr(guided, "init_noise_sigma", 1.0)
+    for timestep in guided.timesteps:
+        scaled = guided.scale_model_input(sample, timestep) if hasattr(scheduler, "scale_model_input") else sample
+        sample = guided.step(model(scaled, timestep), timestep, sample).prev_sample
+    th.testing.assert_close(sample.mean(dim=0), th.full((2,), 0.8 * 100.0 / 101.0), atol=0.02, rtol=0.0)
 
 
 @pytest.mark.parametrize("name", SCHEDULERS)
