@@ -50,9 +50,6 @@ class DistractedTruth(FullyConnected):
         return graph
 
 
-register_discovery_method("distracted_truth", DistractedTruth)
-
-
 def make_model(algorithm: str, env: Any, seed: int, **arguments: Any) -> Any:
     """
     :param algorithm: One of ``NAMES``
@@ -76,13 +73,15 @@ def make_model(algorithm: str, env: Any, seed: int, **arguments: Any) -> Any:
 def class_of(algorithm: str) -> Any:
     """
     :param algorithm: One of ``NAMES``
-    :return: Its class
+    :return: Its class; what its settings name is known from then on
     """
     import sb3_contrib
     import stable_baselines3
 
     from sb3_causalgdp import CausalGDP
 
+    if algorithm == "causalgdp_true":
+        register_discovery_method("distracted_truth", DistractedTruth)
     own = {**dict.fromkeys(VARIANTS, CausalGDP), "tqc": sb3_contrib.TQC, "crossq": sb3_contrib.CrossQ}
     return own.get(algorithm) or getattr(stable_baselines3, algorithm.upper())
 
