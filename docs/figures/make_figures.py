@@ -524,7 +524,7 @@ BENCHMARKS = FOLDER.parents[1] / "benchmarks"
 DISTRACTION = {
     "HalfCheetah-v5 with 100 noise observations": {
         "causal/results/HalfCheetah-v5_causalgdp_m100_k0": ("CausalGDP, sees what matters", BLUE),
-        "causal/results/HalfCheetah-v5_causalgdp_sees_all_m100_k0": ("CausalGDP, sees everything", RED),
+        "causal/results/HalfCheetah-v5_previous_sees_all_m100_k0": ("CausalGDP, sees everything", RED),
         "causal/results/HalfCheetah-v5_sac_m100_k0": ("SAC", GREY),
     },
     "Ant-v5 (105 observations)": {
