@@ -127,6 +127,8 @@ class CausalGuidance:
     :param outcome: The reward or return that is wished for
     :param state_scale: gamma, at least 0
     :param outcome_scale: beta, at least 0
+    :raises ValueError: If a state is not of the world model's size, or a scale is negative
+    :raises TypeError: If the outcome cannot be called
     """
 
     def __init__(
@@ -139,6 +141,11 @@ class CausalGuidance:
         outcome_scale: float = 1.0,
     ) -> None:
         check_at_least_zero(state_scale=state_scale, outcome_scale=outcome_scale)
+        for name, values in (("state", state), ("next_state", next_state)):
+            if values.ndim != 2 or values.shape[1] != world_model.state_dim:
+                raise ValueError(f"{name} must have the shape (batch, {world_model.state_dim}), got {tuple(values.shape)}")
+        if not callable(outcome):
+            raise TypeError(f"outcome must be an OutcomeTarget, such as RewardTarget(th.tensor(1.0)), got {outcome!r}")
         self.world_model = world_model
         self.state = state
         self.next_state = next_state

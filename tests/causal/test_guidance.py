@@ -162,6 +162,15 @@ def test_a_scale_that_is_negative_or_not_finite_is_refused(name, scale, world, s
         CausalGuidance(world, states, wished, make_target("reward"), **{name: scale})
 
 
+def test_states_of_another_size_and_an_outcome_that_is_none_are_named(world, states, wished):
+    with pytest.raises(ValueError, match=r"state must have the shape \(batch, 4\), got \(6, 3\)"):
+        CausalGuidance(world, states[:, :3], wished, RewardTarget(REWARD))
+    with pytest.raises(ValueError, match=r"next_state must have the shape \(batch, 4\), got \(4,\)"):
+        CausalGuidance(world, states, wished[0], RewardTarget(REWARD))
+    with pytest.raises(TypeError, match=r"outcome must be an OutcomeTarget, .* got 1.0"):
+        CausalGuidance(world, states, wished, 1.0)
+
+
 @pytest.mark.parametrize("name", ["reward", "return"])
 def test_linearised_equals_the_guidance_where_it_was_taken(name, world, states, wished, actions):
     guidance = CausalGuidance(world, states, wished, make_target(name))
