@@ -36,7 +36,7 @@ METADATA = "metadata.json"
 """The key of what a file tells of itself, as JSON."""
 # A file whose actions typically differ by more, in half ranges of the action space, is not written
 LARGEST_DIFFERENCE = 1e-4
-N_FEWER = 3
+N_FEWER = 7
 N_CHECKED = 16
 
 
