@@ -36,8 +36,9 @@ METADATA = "metadata.json"
 """The key of what a file tells of itself, as JSON."""
 # A file whose actions typically differ by more, in half ranges of the action space, is not written
 LARGEST_DIFFERENCE = 1e-4
-N_FEWER = 7
 N_CHECKED = 16
+# Rows of a second check, which finds what was traced for the number of the first
+N_FEWER = 7
 
 
 def export_policy(
