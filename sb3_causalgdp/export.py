@@ -77,12 +77,12 @@ def export_policy(
     acting = ExportedPolicy(policy, guided, deterministic, vec_normalize)
     arrays, actions = acting.examples()
     program = _traced(acting, arrays, keeps_solver=suffix != ".onnx")
-    _check_same(acting, arrays, actions, lambda arrays: program(*map(th.as_tensor, arrays)).numpy())
+    _check(acting, arrays, actions, lambda arrays: program(*map(th.as_tensor, arrays)).numpy())
     metadata = json.dumps(acting.metadata(variables), indent=1)
     with replaced_when_done(path) as temporary, _quiet():
         exported = _WRITERS[suffix](program, acting, arrays, metadata, temporary)
         if exported is not None:
-            _check_same(acting, arrays, actions, exported)
+            _check(acting, arrays, actions, exported)
 
 
 class ExportedPolicy(nn.Module):
@@ -286,25 +286,28 @@ def _examples_of(space: spaces.Space, n_rows: int, mean: th.Tensor | float, std:
     return rows
 
 
-def _check_same(acting: ExportedPolicy, arrays: Arrays, actions: np.ndarray, exported: Callable[[Arrays], np.ndarray]) -> None:
-    """For all rows, and for some. In the median: of two candidates that are as good as each other, rounding chooses."""
+def _check(acting: ExportedPolicy, arrays: Arrays, actions: np.ndarray, exported: Callable[[Arrays], np.ndarray]) -> None:
+    """With all rows, and with fewer."""
+    _check_same(acting, actions, exported(arrays))
+    try:
+        of_fewer = exported([array[:N_FEWER] for array in arrays])
+    except Exception as error:
+        raise ValueError(
+            "The policy cannot be exported, because a network in it fixes the number of rows: where a forward() of your own "
+            "takes len(x) of a tensor, take x.shape[0]"
+        ) from error
+    _check_same(acting, actions[:N_FEWER], of_fewer)
+
+
+def _check_same(acting: ExportedPolicy, actions: np.ndarray, exported: np.ndarray) -> None:
+    """In the median: of two candidates that are as good as each other, rounding chooses."""
     half_range = (acting.action_high - acting.action_low).numpy() / 2.0
-    for n_rows in (len(actions), N_FEWER):
-        try:
-            given = exported([array[:n_rows] for array in arrays])
-        except Exception as error:
-            if n_rows == len(actions):
-                raise
-            raise ValueError(
-                "The policy cannot be exported, because a network in it fixes the number of rows: where a forward() of your "
-                "own takes len(x) of a tensor, take x.shape[0]"
-            ) from error
-        difference = np.abs((given - actions[:n_rows]) / half_range).reshape(n_rows, -1).max(axis=1)
-        if not np.median(difference) <= LARGEST_DIFFERENCE:
-            raise RuntimeError(
-                f"The exported policy's actions differ from predict's by {np.median(difference):.2g} half ranges of the "
-                "action space: nothing was written. A policy with a predict() or forward() of its own cannot be exported"
-            )
+    difference = np.abs((exported - actions) / half_range).reshape(len(actions), -1).max(axis=1)
+    if not np.median(difference) <= LARGEST_DIFFERENCE:
+        raise RuntimeError(
+            f"The exported policy's actions differ from predict's by {np.median(difference):.2g} half ranges of the action "
+            "space: nothing was written. A policy with a predict() or forward() of its own cannot be exported"
+        )
 
 
 # Tracing ---------------------------------------------------------------------------------------------------------------

@@ -332,8 +332,7 @@ class DiffusionActor(PickledAlone, BasePolicy):
         self.sampling_steps = sampling_steps
         self.denoiser_kwargs = denoiser_kwargs
         self.schedule = NoiseSchedule(noise_schedule, diffusion_steps)
-        sampling_points(self.schedule, sampling_steps)  # says what is wrong with the number of steps
-        self.n_noises = diffusion_steps if sampling_steps is None else sampling_steps
+        self.n_noises = len(sampling_points(self.schedule, sampling_steps))
         # A denoiser that is asked between its steps learns what is between them
         self.is_continuous = self.n_noises != diffusion_steps
         noisy_enough = (i for i, signal in enumerate(self.schedule.alpha_bar_list) if 1.0 - signal >= self.ADAPTING_NOISE)

@@ -340,7 +340,7 @@ class Updates:
         observations = transitions.next_observations
         with th.no_grad():
             features = self.critic.extract_features(observations, self.critic.features_extractor)
-        with th.enable_grad(), weights_fixed(self.critic):
+        with th.enable_grad(), weights_fixed(self.critic.q_networks[climbed]):
             actions = next_actions.detach().requires_grad_()
             (values,) = q_values(self.critic, features, actions, slice(climbed, climbed + 1))
             (gradient,) = th.autograd.grad(values.sum(), actions)
@@ -366,7 +366,7 @@ class Updates:
             (others,) = q_values(self.critic, features, actions, other_network)
             if self.model.q_scale == "advantage":
                 (replayed,) = q_values(self.critic, features, of_data, other_network)
-        with weights_fixed(self.critic):
+        with weights_fixed(self.critic.q_networks[climbed]):
             (values,) = q_values(self.critic, features, actions, climbed_network)
         return q_loss(values, others, replayed)
 

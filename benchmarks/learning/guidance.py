@@ -68,13 +68,17 @@ def sweep(path: Path, env_id: str, precisions: Sequence[float], episodes: int) -
     some = np.random.default_rng(0).permutation(len(all_seen))[:MOST_OBSERVATIONS]
     observations = all_seen[some]
     unguided = plain.policy.scale_action(played(plain, observations))
+    shown = plain.policy.obs_to_tensor(observations)[0]
+
+    @th.no_grad()
+    def mean_q(actions: np.ndarray) -> float:
+        return float(plain.policy.critic.smallest(shown, th.as_tensor(actions)).mean())
+
+    before, std = mean_q(unguided), float(plain.policy.return_std)
     for precision in precisions:
         model = loaded(path, precision)
         actions = model.policy.scale_action(played(model, observations))
-        with th.no_grad():
-            shown = model.policy.obs_to_tensor(observations)[0]
-            before, after = (model.policy.critic.smallest(shown, th.as_tensor(one)).mean() for one in (unguided, actions))
-            gain = float((after - before) / plain.policy.return_std)
+        gain = (mean_q(actions) - before) / std
         returns = returns_of(functools.partial(played, model), env, SELECTION_SEED)
         moved = np.abs(actions - unguided).mean()
         lines.append(f"| | {precision:g} | {moved:.3f} | {gain:+.4f} | {returns.mean():.0f} +- {returns.std():.0f} |")

@@ -56,10 +56,12 @@ def read(folder: Path, env_id: str, steps: int | None = None, names: Sequence[st
     :param names: Of the algorithms and variants, None for all
     :return: By name
     """
-    tables = tables_of(folder, env_id, names)
-    for name, by_seed in tables.items():
-        tables[name] = {seed: one for seed, one in by_seed.items() if steps is None or one["timesteps"][-1] >= steps}
-    return {name: _curves(by_seed, steps) for name, by_seed in tables.items() if by_seed}
+    curves = {}
+    for name, by_seed in tables_of(folder, env_id, names).items():
+        far_enough = {seed: one for seed, one in by_seed.items() if steps is None or one["timesteps"][-1] >= steps}
+        if far_enough:
+            curves[name] = _curves(far_enough, steps)
+    return curves
 
 
 def tables_of(folder: Path, env_id: str, names: Sequence[str] | None = None) -> dict[str, dict[int, np.ndarray]]:
@@ -142,17 +144,21 @@ def table(results: Mapping[str, Curves], against: str | None = None, level: floa
         if level is not None:
             row.append(", ".join(f"{seconds:.0f}" for seconds in seconds_to(curves, level)))
         rows.append(row)
-    return "\n".join("| " + " | ".join(row) + " |" for row in rows)
+    return _in_markdown(rows)
 
 
 def table_of_seeds(tables: Mapping[str, Mapping[int, np.ndarray]], at: Sequence[int]) -> str:
     """A table in Markdown of what each seed had reached after some steps, blank where it was not evaluated."""
     rows = [["", "seed", *(f"{step:,}" for step in at), "CPU seconds"], ["---"] * (len(at) + 3)]
     for name, by_seed in tables.items():
-        for seed, table in sorted(by_seed.items()):
-            reached = dict(zip(table["timesteps"], table["mean_return"], strict=True))
+        for seed, one in sorted(by_seed.items()):
+            reached = dict(zip(one["timesteps"], one["mean_return"], strict=True))
             cells = [f"{reached[step]:.0f}" if step in reached else "" for step in at]
-            rows.append([name, str(seed), *cells, f"{table['cpu_seconds'][-1]:.0f}"])
+            rows.append([name, str(seed), *cells, f"{one['cpu_seconds'][-1]:.0f}"])
+    return _in_markdown(rows)
+
+
+def _in_markdown(rows: Sequence[Sequence[str]]) -> str:
     return "\n".join("| " + " | ".join(row) + " |" for row in rows)
 
 

@@ -222,8 +222,7 @@ class _Critic:
         hidden = np.repeat(weight[:, :n_features] @ features + bias, n_candidates, axis=1)
         hidden += weight[:, n_features:] @ actions
         for norm, batch_norm, (next_weight, next_bias) in zip(self.norms, batch_norms, layers, strict=True):
-            output = self._hidden(norm, hidden).output
-            hidden = next_weight.dot(output if batch_norm is None else batch_norm(output))
+            hidden = next_weight.dot(_normalised(batch_norm, self._hidden(norm, hidden).output))
             hidden += next_bias
         return self.value_of(hidden)
 
@@ -238,12 +237,12 @@ class _Critic:
     def forward(self, inputs: np.ndarray) -> tuple[np.ndarray, list[_Hidden]]:
         """The outputs, and the hidden layers."""
         hidden: list[_Hidden] = []
-        product = inputs
-        for index, (batch_norm, (weight, bias)) in enumerate(zip(self._batch_norms_now(), self.layers, strict=True)):
-            if index > 0:
-                hidden.append(self._hidden(self.norms[index - 1], product))
-                inputs = hidden[-1].output
-            product = weight.dot(inputs if batch_norm is None else batch_norm(inputs))
+        (weight, bias), *layers = self.layers
+        first_norm, *batch_norms = self._batch_norms_now()
+        product = weight.dot(_normalised(first_norm, inputs)) + bias
+        for norm, batch_norm, (weight, bias) in zip(self.norms, batch_norms, layers, strict=True):
+            hidden.append(self._hidden(norm, product))
+            product = weight.dot(_normalised(batch_norm, hidden[-1].output))
             product += bias
         return product, hidden
 
@@ -252,13 +251,13 @@ class _Critic:
         return [norm.now() for norm in self.batch_norms] or [None] * len(self.layers)
 
     def _hidden(self, norm: LayerNorm | None, product: np.ndarray) -> _Hidden:
-        normalised = product if norm is None else norm(product)
+        normalised = _normalised(norm, product)
         return _Hidden(product, normalised, self.activation.value(normalised))
 
     def backward(self, outputs: np.ndarray, hidden: list[_Hidden], n_states: int) -> np.ndarray:
         """Gradient of Q by the states, the first of the inputs."""
         weights = [weight for weight, _ in self.layers]
-        slopes = [None if norm is None else norm.slope for norm in self._batch_norms_now()]
+        first_norm, *batch_norms = self._batch_norms_now()
         weights[0] = weights[0][:, :n_states]
         gradient = weights[-1].T
         if self.n_kept < len(outputs):
@@ -266,13 +265,17 @@ class _Critic:
             gradient = weights[-1][smallest].mean(axis=0).T
         elif self.n_kept > 1:
             gradient = gradient.mean(axis=1, keepdims=True)
-        for index in reversed(range(len(hidden))):
-            layer, norm, slope = hidden[index], self.norms[index], slopes[index + 1]
-            if slope is not None:
-                gradient = gradient * slope
+        of_layers = (weights[-2::-1], reversed(hidden), reversed(self.norms), reversed(batch_norms))
+        for weight, layer, norm, batch_norm in zip(*of_layers, strict=True):
+            if batch_norm is not None:
+                gradient = gradient * batch_norm.slope
             gradient = gradient * self.activation.derivative(layer.normalised, layer.output)
-            gradient = weights[index].T.dot(gradient if norm is None else norm.backward(gradient, layer.product))
-        return gradient if slopes[0] is None else gradient * slopes[0][:n_states]
+            gradient = weight.T.dot(gradient if norm is None else norm.backward(gradient, layer.product))
+        return gradient if first_norm is None else gradient * first_norm.slope[:n_states]
+
+
+def _normalised(norm: LayerNorm | SlopeAndOffset | None, values: np.ndarray) -> np.ndarray:
+    return values if norm is None else norm(values)
 
 
 class Critics:
