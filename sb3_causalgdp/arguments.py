@@ -171,7 +171,7 @@ GROUPS: dict[str, dict[str, Kind]] = {
         "seed": integer(0, 2**32 - 1) | NONE,
         "verbose": integer(0, MOST_STEPS) | FLAG,
         "device": Kind("'auto' or a device that PyTorch has here, such as 'cpu' or 'cuda:0'", _read_device),
-        "compile": FLAG | accepts("a mode of torch.compile", lambda value: isinstance(value, str) and value != ""),
+        "compile": FLAG | accepts("'auto' or a mode of torch.compile", lambda value: isinstance(value, str) and value != ""),
         "cuda_graph": FLAG | choice(["auto"]),
         "torch_threads": integer(1, MOST_THREADS) | choice(["auto"]) | NONE,
         "tensorboard_log": PATH | NONE,

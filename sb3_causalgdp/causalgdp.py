@@ -12,7 +12,7 @@ from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy, ContinuousCritic
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule, TrainFreq, TrainFrequencyUnit
 from stable_baselines3.common.utils import FloatSchedule, update_learning_rate
 
 from sb3_causalgdp.acceleration.gradients import check_compile
@@ -164,7 +164,9 @@ class CausalGDP(AskedAlgorithm, DistilledAlgorithm, CheckedAlgorithm):
         :class:`~sb3_causalgdp.policies.CausalGDPPolicy`
     :param compile: Whether to compile with ``torch.compile``, or its ``mode``: one graph for the loss and the gradients of
         each network, including the world model and the guidance. The first updates then take a minute or two; the numbers are
-        the same up to rounding. Saved models do not depend on it. Needs PyTorch 2.13 and, on a CPU, a C++ compiler
+        the same up to rounding. Saved models do not depend on it. Needs PyTorch 2.13 and, on a CPU, a C++ compiler.
+        ``auto`` compiles on a CPU that has them, if a call of ``learn()`` or ``pretrain()`` is to make at least 50,000
+        gradient steps, with vectors as observations and no networks of your own
     :param cuda_graph: Whether gradient steps after the first hundred are recorded as CUDA graphs and replayed, with or without
         ``compile``: on a GPU, launching the kernels takes longer than their work. The numbers are those of the plain steps.
         ``"auto"`` is True on a GPU, unless an optimizer cannot be recorded or ``compile`` makes CUDA graphs itself
@@ -258,7 +260,7 @@ class CausalGDP(AskedAlgorithm, DistilledAlgorithm, CheckedAlgorithm):
         stats_window_size: int = 100,
         tensorboard_log: str | None = None,
         policy_kwargs: dict[str, Any] | None = None,
-        compile: bool | str = False,
+        compile: bool | str = "auto",
         cuda_graph: bool | str = "auto",
         torch_threads: int | str | None = "auto",
         verbose: int = 0,
@@ -346,6 +348,7 @@ class CausalGDP(AskedAlgorithm, DistilledAlgorithm, CheckedAlgorithm):
         self.state_names = state_names
         self.action_names = action_names
         self.compile = compile
+        self._is_compiled = False
         self.cuda_graph = cuda_graph
         self.torch_threads = torch_threads
 
@@ -444,10 +447,27 @@ class CausalGDP(AskedAlgorithm, DistilledAlgorithm, CheckedAlgorithm):
         # Again, for models that were loaded: those that are not trained need no compiler and no GPU
         check_compile(self.compile, self.device)
         self._updates.fast.check_recordable()
+        self._compile_if_worth_it()
         callbacks = with_own(self, callback_list(callback), self.causal_refresh_freq)
         all_of_them = super()._init_callback(CallbackList(callbacks), progress_bar)
         begin_training(self, all_of_them)
         return all_of_them
+
+    def _compile_if_worth_it(self) -> None:
+        """As ``compile="auto"`` says; a resumed training goes on as it was, to the last bit."""
+        begins = self.policy.is_plain and self._updates.fast.expect(self._n_gradient_steps_planned(), self._is_compiled)
+        if begins and self.verbose >= 1:
+            print("Compiling the updates, which takes a minute or two (compile=False: not)")
+        self._is_compiled = self._is_compiled or begins
+
+    def _n_gradient_steps_planned(self) -> int:
+        n_steps = self._total_timesteps - self._num_timesteps_at_start
+        if self.is_pretraining or self.gradient_steps < 0:
+            return n_steps
+        assert isinstance(self.train_freq, TrainFreq)
+        if self.train_freq.unit is TrainFrequencyUnit.EPISODE:
+            return 0  # nobody knows how many
+        return n_steps // (self.train_freq.frequency * self.n_envs) * self.gradient_steps
 
     def train(self, gradient_steps: int, batch_size: int = 256) -> None:
         if self._waits_for_episode():
@@ -539,6 +559,7 @@ class CausalGDP(AskedAlgorithm, DistilledAlgorithm, CheckedAlgorithm):
             "_fed_offline_position",
             "_checkpoints",
             "_resumed_at_gradient_step",
+            "_is_compiled",
             "causal_graph_history",
             "relevance_gate",
             "trusted_components",

@@ -157,9 +157,10 @@ class CausalGDPPolicy(AbstractingPolicy):
         if n_quantiles is not None:
             check_quantiles(n_quantiles, top_quantiles_to_drop_per_net)
         gates_actions = denoiser == "mlp" and not one_pass
+        gates_states = StandardizedExtractor.may_cover(features_extractor_class)
+        is_plain = gates_actions and gates_states and not self._has_images(observation_space, normalize_images)
         if causal_abstraction == "auto":
-            gates_states = StandardizedExtractor.may_cover(features_extractor_class)
-            causal_abstraction = gates_actions and gates_states and not self._has_images(observation_space, normalize_images)
+            causal_abstraction = is_plain
         elif causal_abstraction and not gates_actions:
             what = "a policy that acts in one pass" if one_pass else f"denoiser={denoiser!r}"
             raise ValueError(
@@ -175,6 +176,8 @@ class CausalGDPPolicy(AbstractingPolicy):
             squash_output=True,
             normalize_images=normalize_images,
         )
+        self.is_plain = is_plain
+        """Whether observations are vectors, and no part is the user's own."""
         self.guidance_rule = None if guidance is None else GuidanceRule(guidance, guidance_covariance, guidance_scale)
         self.guidance_kwargs: dict[str, Any] = {
             "guidance": guidance,

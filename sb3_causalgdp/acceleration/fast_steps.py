@@ -3,13 +3,15 @@
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from functools import partial
+from threading import current_thread, main_thread
 from typing import Any
+from warnings import warn
 
 import torch as th
 
 from sb3_causalgdp.acceleration import switch
 from sb3_causalgdp.acceleration.cuda_graphs import Losses, UpdateGraphs, why_not_recorded
-from sb3_causalgdp.acceleration.gradients import compiled, without_checks
+from sb3_causalgdp.acceleration.gradients import compiled, why_not_compiled, without_checks
 
 
 class FastSteps:
@@ -17,16 +19,20 @@ class FastSteps:
     What makes gradient steps fast, as a model's arguments say; where they say nothing, the steps are made as they are.
 
     :param optimizers: Those that the steps use
-    :param compile_mode: The argument ``compile``: False, True or a mode of ``torch.compile``
+    :param compile_mode: The argument ``compile``: False, True, a mode of ``torch.compile`` or ``"auto"``
     :param cuda_graph: The argument ``cuda_graph``: True, False or ``"auto"``
     :param device: Where the networks are
     """
+
+    # Compiling takes a minute or two, and saves 3 ms of each
+    WORTH_COMPILING = 50_000
 
     def __init__(
         self, optimizers: Sequence[th.optim.Optimizer], compile_mode: bool | str, cuda_graph: bool | str, device: th.device
     ) -> None:
         self._optimizers, self._cuda_graph, self._device = optimizers, cuda_graph, device
-        self._compile_mode = compile_mode if switch.is_on() else False
+        self._may_compile = compile_mode == "auto" and switch.is_on()
+        self._compile_mode = compile_mode if switch.is_on() and not self._may_compile else False
         self.graphs: UpdateGraphs | None = None
         self.forget_recordings()
 
@@ -51,7 +57,36 @@ class FastSteps:
         :param function: Takes tensors, and may take gradients
         :return: The function, compiled if that was asked for
         """
+        if self._may_compile:
+            return partial(self._compiled_or_plain, compiled(function, True, self._device), function)
         return compiled(function, self._compile_mode, self._device) if self._compile_mode else function
+
+    def _compiled_or_plain(self, fast: Callable[..., Any], plain: Callable[..., Any], *args: Any) -> Any:
+        if not self._compile_mode:
+            return plain(*args)
+        try:
+            return fast(*args)
+        except th._dynamo.exc.TorchDynamoException as error:
+            reason = str(getattr(error, "inner_exception", error)).strip().split("\n")[0]
+            warn(f"PyTorch cannot compile the updates, which go on as they are (compile=False does not try): {reason}")
+            self._may_compile = self._compile_mode = False
+            return plain(*args)
+
+    def expect(self, gradient_steps: int, was_compiled: bool) -> bool:
+        """
+        Let ``compile="auto"`` decide. What is compiled stays so.
+
+        :param gradient_steps: How many are to come
+        :param was_compiled: Whether they continue compiled ones
+        :return: Whether this compiles what was not compiled before
+        """
+        # A GPU is fast with recordings alone; PyTorch's settings for a compiler are those of all threads
+        may_begin = self._may_compile and not self._compile_mode and self._device.type == "cpu"
+        is_worth_it = was_compiled or gradient_steps >= self.WORTH_COMPILING
+        if may_begin and is_worth_it and current_thread() is main_thread() and why_not_compiled("auto", self._device) is None:
+            self._compile_mode = True
+            return True
+        return False
 
     def branch(self) -> Callable[[], AbstractContextManager[None]]:
         """

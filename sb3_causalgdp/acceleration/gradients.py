@@ -80,26 +80,36 @@ def without_checks() -> AbstractContextManager[None]:
 
 def check_compile(mode: bool | str, device: th.device) -> None:
     """
-    :param mode: False, True, or a mode of ``torch.compile``
+    :param mode: False, True, ``"auto"`` or a mode of ``torch.compile``
     :param device: Where the graphs would run
-    :raises ValueError: If the mode is unknown, this PyTorch cannot have a backward pass in a compiled graph, or a CPU's graphs
-        find no C++ compiler
+    :raises ValueError: If the mode is unknown, or cannot be had
     """
-    if mode is False or not switch.is_on():
+    if mode in (False, "auto") or not switch.is_on():
         return
+    modes = list(th._inductor.list_mode_options())
+    if mode is not True and mode not in modes:
+        raise ValueError(f"compile must be True, False, 'auto' or one of {modes}, got {mode!r}")
+    reason = why_not_compiled(mode, device)
+    if reason is not None:
+        raise ValueError(reason)
+
+
+def why_not_compiled(mode: bool | str, device: th.device) -> str | None:
+    """
+    :param mode: What was asked for
+    :param device: Where the graphs would run
+    :return: Why this PyTorch cannot have a backward pass in a compiled graph, or a CPU's graphs find no C++ compiler; None if
+        they can be had
+    """
     # Two seconds, which those who do not compile need not wait
     from torch._inductor.cpp_builder import get_cpp_compiler
 
-    modes = list(th._inductor.list_mode_options())
-    if mode is not True and mode not in modes:
-        raise ValueError(f"compile must be True, False or one of {modes}, got {mode!r}")
     has_arguments = "isolate_recompiles" in inspect.signature(th.compile).parameters
     if not (has_arguments and hasattr(th._dynamo.config, "trace_autograd_ops")):
-        raise ValueError(
-            f"compile={mode!r} needs PyTorch 2.13 or newer, this is {th.__version__}; compile=False works with it"
-        )
+        return f"compile={mode!r} needs PyTorch 2.13 or newer, this is {th.__version__}; compile=False works with it"
     if device.type == "cpu":
         try:
             get_cpp_compiler()
         except RuntimeError as error:
-            raise ValueError(f"compile={mode!r} needs a C++ compiler such as g++, and none was found: {error}") from error
+            return f"compile={mode!r} needs a C++ compiler such as g++, and none was found: {error}"
+    return None

@@ -47,6 +47,7 @@ ATTRIBUTES = (
     "action_noise",
     "_offline_marks",
     "_fed_offline_position",
+    "_is_compiled",
 )
 # Set by learn() when it starts, in vain where it goes on
 SET_BY_LEARN = ("action_noise",)

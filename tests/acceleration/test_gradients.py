@@ -68,7 +68,7 @@ def test_compile_says_that_a_compiler_is_missing_but_a_saved_model_plays_without
 
 @pytest.mark.parametrize("mode", ["fast", 2, None])
 def test_unknown_compile_modes_are_named(mode):
-    with pytest.raises(ValueError, match=r"compile must be True(,| or) False or (one|a mode) of"):
+    with pytest.raises(ValueError, match=r"compile must be True(,| or) False(,| or) 'auto' or (one|a mode) of"):
         CausalGDP("MlpPolicy", "Pendulum-v1", compile=mode)
 
 
