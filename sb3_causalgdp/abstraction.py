@@ -20,6 +20,8 @@ class AbstractingPolicy(SteeredPolicy):
     action_gate: th.Tensor
     normalize_observations: bool
     causal_abstraction: bool
+    n_shown_actions: int
+    """Number of action components that are not hidden."""
 
     @th.no_grad()
     def update_observation_statistics(self) -> None:
@@ -72,6 +74,7 @@ class AbstractingPolicy(SteeredPolicy):
                 factor.copy_(self.state_gate)
 
     def _write_action_gates(self) -> None:
+        self.n_shown_actions = max(1, int(self.action_gate.sum()))
         for network in (self.actor, self.actor_target, self.critic, self.critic_target):
             assert network.action_gate is not None
             network.action_gate.copy_(self.action_gate)

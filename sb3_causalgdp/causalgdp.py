@@ -101,7 +101,8 @@ class CausalGDP(AskedAlgorithm, DistilledAlgorithm, CheckedAlgorithm):
     :param pessimism: How far TD targets go from the mean of the critics, 0, to the smallest of them, 1 (clipped double
         Q-learning, as in TD3 and SAC). ``auto`` begins at 0, or at 1 after pretraining, and follows at each refresh of the
         graph: up if critics promise more than was obtained, else down. In :meth:`pretrain` it is always 1
-    :param target_policy_noise: Standard deviation of the noise on the actions of TD targets, as in TD3
+    :param target_policy_noise: Standard deviation of the noise on the actions of TD targets, as in TD3; ``auto`` as for
+        ``exploration_noise``
     :param target_noise_clip: Limit on its absolute value
     :param max_q_backup: Whether the TD target takes the best of ten sampled actions (Diffusion-QL, for AntMaze)
     :param max_grad_norm: Limit on the gradient norms of the actor and the critics, None for no limit
@@ -112,7 +113,8 @@ class CausalGDP(AskedAlgorithm, DistilledAlgorithm, CheckedAlgorithm):
     :param n_action_candidates: Number of sampled actions from which a prediction takes the best, by the smallest of the
         critics' Q, or see ``exploration_optimism``
     :param exploration_noise: Standard deviation of the Gaussian noise of non-deterministic predictions, for actions in
-        [-1, 1]; a number or a function of the current progress remaining (from 1 to 0)
+        [-1, 1]; a number or a function of the current progress remaining (from 1 to 0). ``auto`` is 0.3 divided by the square
+        root of the number of action components, without hidden ones, so that all of them together deviate as far in every task
     :param exploration_optimism: By what non-deterministic predictions judge candidates, in [-1, 1]: 1 for the largest of the
         critics' Q, 0 for their mean, -1 for the smallest, by which deterministic ones always do. What the critics disagree
         about is tried then (optimistic exploration, Ciosek et al., 2019, https://arxiv.org/abs/1910.12807)
@@ -225,7 +227,7 @@ class CausalGDP(AskedAlgorithm, DistilledAlgorithm, CheckedAlgorithm):
         policy_delay: int = 3,
         world_model_delay: int = 2,
         pessimism: float | str = 0.5,
-        target_policy_noise: float = 0.2,
+        target_policy_noise: float | str = "auto",
         target_noise_clip: float = 0.5,
         max_q_backup: bool = False,
         max_grad_norm: float | None = None,
@@ -234,7 +236,7 @@ class CausalGDP(AskedAlgorithm, DistilledAlgorithm, CheckedAlgorithm):
         sampler: str = "ddpm",
         ddim_eta: float = 0.0,
         n_action_candidates: int = 10,
-        exploration_noise: float | Schedule = 0.2,
+        exploration_noise: float | str | Schedule = "auto",
         exploration_optimism: float = 1.0,
         exploration_temperature: float = 0.0,
         guidance: str | None = "posterior",
@@ -413,7 +415,8 @@ class CausalGDP(AskedAlgorithm, DistilledAlgorithm, CheckedAlgorithm):
 
     def _own_policy_kwargs(self) -> dict[str, Any]:
         own = {name: getattr(self, name) for name in (*OF_CANDIDATES, *DIFFUSION_ARGUMENTS, *GUIDANCE_ARGUMENTS)}
-        own["exploration_noise"] = FloatSchedule(self.exploration_noise)(1.0)
+        noise = self.exploration_noise
+        own["exploration_noise"] = FloatSchedule(noise)(1.0) if callable(noise) else noise
         networks = {"one_pass": self.actor_update == "trust_region", "value_network": self.expectile is not None}
         asked = {name: True for name, is_asked in networks.items() if is_asked}
         # Arguments of the gate ask for one

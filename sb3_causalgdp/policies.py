@@ -36,6 +36,7 @@ from sb3_causalgdp.networks import Critic, DiffusionActor, activation_class
 from sb3_causalgdp.prediction import act, check_observation, fixed_noise
 from sb3_causalgdp.saving.models import KNOWN
 from sb3_causalgdp.saving.plain import Known
+from sb3_causalgdp.noise import noise_scale
 from sb3_causalgdp.steering import leaf_spaces
 
 
@@ -142,7 +143,7 @@ class CausalGDPPolicy(AbstractingPolicy):
         state_guidance_scale: float = 0.01,
         outcome_guidance_scale: float = 1.0,
         n_action_candidates: int = 10,
-        exploration_noise: float = 0.2,
+        exploration_noise: float | str = "auto",
         exploration_optimism: float = 1.0,
         exploration_temperature: float = 0.0,
         discount: float = 0.99,
@@ -196,7 +197,7 @@ class CausalGDPPolicy(AbstractingPolicy):
         self.state_guidance_scale = state_guidance_scale
         self.outcome_guidance_scale = outcome_guidance_scale
         self.n_action_candidates = n_action_candidates
-        self.exploration_noise = exploration_noise
+        self._exploration_noise = exploration_noise
         self.exploration_optimism = exploration_optimism
         self.exploration_temperature = exploration_temperature
         self.discount = discount
@@ -258,6 +259,7 @@ class CausalGDPPolicy(AbstractingPolicy):
             self.register_buffer("state_gate", th.ones(sum(self.leaf_sizes)))
             self.register_buffer("action_gate", th.ones(spaces.flatdim(self.action_space)))
         self.actor = self.make_actor()
+        self.n_shown_actions = self.actor.action_dim
         self.actor_target = self.make_actor()
         self.actor_target.load_state_dict(self.actor.state_dict())
         # With a shared features extractor, targets share theirs too, see SB3's TD3Policy
@@ -401,6 +403,15 @@ class CausalGDPPolicy(AbstractingPolicy):
             update to the next; the actor itself where it explores, and without ``use_ema``
         """
         return self.actor_target if deterministic and self.use_ema else self.actor
+
+    @property
+    def exploration_noise(self) -> float:
+        """Standard deviation of the noise of non-deterministic predictions, for actions in [-1, 1]."""
+        return noise_scale(self._exploration_noise, self.n_shown_actions)
+
+    @exploration_noise.setter
+    def exploration_noise(self, noise: float | str) -> None:
+        self._exploration_noise = noise
 
     def acting_optimism(self, deterministic: bool) -> float:
         """

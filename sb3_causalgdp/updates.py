@@ -29,6 +29,7 @@ from sb3_causalgdp.losses import (
     trust_region_loss,
     world_model_loss,
 )
+from sb3_causalgdp.noise import noise_scale
 from sb3_causalgdp.networks import network_outputs, q_values, smallest_q, weights_fixed
 from sb3_causalgdp.step_plans import StepPlan
 
@@ -67,8 +68,9 @@ class Updates:
         self.actor, self.critic = policy.actor, policy.critic
         self.actor_target, self.critic_target = policy.actor_target, policy.critic_target
         self.batches = Batches(model)
-        # A tensor, so that a change is no other program
+        # Tensors, so that a change is no other program
         self.pessimism = th.zeros((), device=model.device)
+        self.target_noise = th.full((), self._target_noise_scale(), device=model.device)
         networks = (self.actor, self.actor_target, self.critic, self.critic_target, self.world_model)
         # Once, because to visit all modules takes a hundredth of a gradient step
         self._parameters: dict[th.nn.Module, list[th.Tensor]] = {network: [*network.parameters()] for network in networks}
@@ -83,6 +85,9 @@ class Updates:
         self.fast = FastSteps(self.optimizers(), model.compile, model.cuda_graph, model.device)
         for name in self.COMPILED:
             setattr(self, name, self.fast.compiled(getattr(self, name)))
+
+    def _target_noise_scale(self) -> float:
+        return noise_scale(self.model.target_policy_noise, self.policy.n_shown_actions)
 
     def optimizers(self) -> list[th.optim.Optimizer]:
         """
@@ -107,6 +112,7 @@ class Updates:
         chosen = model.calibrated_pessimism if model.pessimism == "auto" else model.pessimism
         # On a fixed dataset, nothing corrects critics that are too hopeful
         self.pessimism.fill_(1.0 if model.is_pretraining else chosen)
+        self.target_noise.fill_(self._target_noise_scale())
         with n_threads_at_most(model.torch_threads, self.policy.has_image_state):
             yield self.fast.made_fast(gradient_steps, (weights, of_methods, rates, scales))
 
@@ -193,11 +199,10 @@ class Updates:
         :param actions: Shape ``(batch, d)``
         :return: The same with clipped noise, so that no narrow peak of Q becomes a target (TD3)
         """
-        model = self.model
-        if model.target_policy_noise == 0.0:
+        if self.model.target_policy_noise == 0.0:
             return actions
-        noise = model.target_policy_noise * th.randn_like(actions)
-        return (actions + noise.clamp(-model.target_noise_clip, model.target_noise_clip)).clamp(-1.0, 1.0)
+        noise, clip = self.target_noise * th.randn_like(actions), self.model.target_noise_clip
+        return (actions + noise.clamp(-clip, clip)).clamp(-1.0, 1.0)
 
     def update_critics(self, replay_data, for_critics: th.Tensor, running_weight: float) -> Losses:
         """

@@ -61,16 +61,16 @@ class FastSteps:
             return partial(self._compiled_or_plain, compiled(function, True, self._device), function)
         return compiled(function, self._compile_mode, self._device) if self._compile_mode else function
 
-    def _compiled_or_plain(self, fast: Callable[..., Any], plain: Callable[..., Any], *args: Any) -> Any:
+    def _compiled_or_plain(self, fast: Callable[..., Any], plain: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
         if not self._compile_mode:
-            return plain(*args)
+            return plain(*args, **kwargs)
         try:
-            return fast(*args)
+            return fast(*args, **kwargs)
         except th._dynamo.exc.TorchDynamoException as error:
             reason = str(getattr(error, "inner_exception", error)).strip().split("\n")[0]
             warn(f"PyTorch cannot compile the updates, which go on as they are (compile=False does not try): {reason}")
             self._may_compile = self._compile_mode = False
-            return plain(*args)
+            return plain(*args, **kwargs)
 
     def expect(self, gradient_steps: int, was_compiled: bool) -> bool:
         """

@@ -62,10 +62,10 @@ def compiled(function: Callable[..., Any], mode: bool | str, device: th.device) 
         return run, th._dynamo.config.patch(trace_autograd_ops=True)
 
     @wraps(function)
-    def call(*args: Any) -> Any:
+    def call(*args: Any, **kwargs: Any) -> Any:
         run, tracing_gradients = graph()
         with tracing_gradients:
-            return run(*args)
+            return run(*args, **kwargs)
 
     return call
 
