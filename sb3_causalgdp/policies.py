@@ -33,10 +33,10 @@ from sb3_causalgdp.divergence import TrainingDivergedError
 from sb3_causalgdp.export import export_policy
 from sb3_causalgdp.extractors import StandardizedExtractor
 from sb3_causalgdp.networks import Critic, DiffusionActor, activation_class
+from sb3_causalgdp.noise import noise_scale
 from sb3_causalgdp.prediction import act, check_observation, fixed_noise
 from sb3_causalgdp.saving.models import KNOWN
 from sb3_causalgdp.saving.plain import Known
-from sb3_causalgdp.noise import noise_scale
 from sb3_causalgdp.steering import leaf_spaces
 
 

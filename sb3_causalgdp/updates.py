@@ -29,8 +29,8 @@ from sb3_causalgdp.losses import (
     trust_region_loss,
     world_model_loss,
 )
-from sb3_causalgdp.noise import noise_scale
 from sb3_causalgdp.networks import network_outputs, q_values, smallest_q, weights_fixed
+from sb3_causalgdp.noise import noise_scale
 from sb3_causalgdp.step_plans import StepPlan
 
 Model = Any  # a CausalGDP, whose file imports this one

@@ -58,6 +58,7 @@ class TwoMasses(gym.Env):
 
 def make(env=None, share=0.5, **arguments):
     rarely = {"batch_size": 4, "train_freq": 100, "gradient_steps": 1, "causal_refresh_freq": 500, "buffer_size": 5_000}
+    rarely |= {"exploration_noise": 0.2, "target_policy_noise": 0.2}
     kwargs = {**SMALL, **rarely, **arguments}
     return CausalGDP("MlpPolicy", TwoMasses() if env is None else env, counterfactual_replay=share, **kwargs)
 

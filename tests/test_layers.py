@@ -47,7 +47,7 @@ LAYERS = [
         "saving.archives",
         "extractors",
     },
-    {"kinds", "saving.numpy_pickles", "acceleration.switch", "acceleration", "saving", "moved", "presets"},
+    {"kinds", "noise", "saving.numpy_pickles", "acceleration.switch", "acceleration", "saving", "moved", "presets"},
 ]
 # Graphs and answers are drawn by pictures that know them: this file imports those late, and no other does
 LATE = {("causal.drawing", "causal.plots")}

@@ -19,7 +19,7 @@ from sb3_causalgdp.saving.numpy_pickles import in_place_of
 
 # What bookkeeping is made of; none of it runs what a file says
 PLAIN: dict[str, set[str]] = {
-    "builtins": {"bytearray", "complex", "frozenset", "object", "range", "set", "slice"},
+    "builtins": {"bytearray", "complex", "frozenset", "getattr", "object", "range", "set", "slice"},
     "collections": {"OrderedDict", "defaultdict", "deque"},
     "copyreg": {"_reconstructor"},
     "_codecs": {"encode"},

@@ -1,5 +1,9 @@
-"""What a pickle that is not trusted gets in place of numpy's names: numpy believes a state, also one that points anywhere."""
+"""
+What a pickle that is not trusted gets in place of numpy's names, which believe a state, also one that points anywhere, and of
+``getattr``, which could reach all that can be called.
+"""
 
+import enum
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -126,7 +130,15 @@ def _random_state(generator: Any = "MT19937", *_: Any) -> np.random.RandomState:
     return RandomState(_checked(generator))
 
 
+def _member(of: Any, name: Any, *_: Any) -> enum.Enum:
+    """What Python 3.11.0 to 3.11.3 write ``getattr`` for."""
+    if not (isinstance(of, type) and issubclass(of, enum.Enum) and isinstance(name, str) and name in of.__members__):
+        raise ValueError(f"it asks for {str(name)[:40]!r} of something that is no enumeration, which could run code")
+    return of[name]
+
+
 NAMES: dict[str, dict[str, Any]] = {
+    "builtins": {"getattr": _member},
     "numpy": {"dtype": plain_dtype, "ndarray": ARRAY},
     "numpy._core.multiarray": {"_reconstruct": _reconstruct},
     "numpy.core.multiarray": {"_reconstruct": _reconstruct},

@@ -5,12 +5,12 @@ from threading import Thread
 
 import pytest
 import torch as th
+from stable_baselines3.common.envs import FakeImageEnv
 from stable_baselines3.common.torch_layers import FlattenExtractor
 from torch._dynamo.exc import BackendCompilerFailed
 
 from sb3_causalgdp import CausalGDP
 from sb3_causalgdp.acceleration.fast_steps import FastSteps
-from stable_baselines3.common.envs import FakeImageEnv
 
 SMALL = {"net_arch": [8], "n_critics": 1, "world_model_net_arch": [8]}
 N_STEPS = 40

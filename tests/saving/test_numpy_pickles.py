@@ -11,6 +11,7 @@ from collections import OrderedDict
 import numpy as np
 import pytest
 from numpy._core import multiarray
+from stable_baselines3.her.goal_selection_strategy import GoalSelectionStrategy
 
 from sb3_causalgdp.checkpoints.pickles import from_bytes, to_bytes
 from sb3_causalgdp.saving.archives import read_pickle
@@ -192,3 +193,31 @@ def test_a_bit_in_ten_is_a_file_that_is_refused_or_read():
         except Exception as error:
             assert not isinstance(error, SystemError)
     assert 0 < n_read < 200
+
+
+READERS = {
+    "archives": lambda data: read_pickle(io.BytesIO(data)),
+    "checkpoints": lambda data: from_bytes(data, allowed=[GoalSelectionStrategy]),
+}
+
+
+@pytest.mark.parametrize("reader", READERS)
+def test_a_member_of_an_enumeration_is_read_as_python_3_11_0_to_3_11_3_write_it(reader):
+    data = pickle.dumps(Call(getattr, (GoalSelectionStrategy, "FUTURE")))
+    assert READERS[reader](data) is GoalSelectionStrategy.FUTURE
+
+
+@pytest.mark.parametrize("reader", READERS)
+@pytest.mark.parametrize(
+    ("of", "name"),
+    [
+        (bytearray, "fromhex"),
+        (GoalSelectionStrategy, "mro"),
+        (GoalSelectionStrategy, "__class__"),
+        ({}, "pop"),
+        (np.float64, "fromhex"),
+    ],
+)
+def test_getattr_gives_nothing_else(reader, of, name):
+    with pytest.raises(ValueError, match="no enumeration, which could run code"):
+        READERS[reader](pickle.dumps(Call(getattr, (of, name))))
