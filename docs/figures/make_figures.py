@@ -523,8 +523,8 @@ BENCHMARKS = FOLDER.parents[1] / "benchmarks"
 # Of each panel: title, and for each curve the files' names and what they are
 DISTRACTION = {
     "HalfCheetah-v5 with 100 noise observations": {
-        "causal/results/HalfCheetah-v5_causalgdp_m100_k0": ("CausalGDP, sees what matters", BLUE),
-        "causal/results/HalfCheetah-v5_previous_sees_all_m100_k0": ("CausalGDP, sees everything", RED),
+        "causal/results/HalfCheetah-v5_noise-0.2_m100_k0": ("CausalGDP, sees what matters", BLUE),
+        "causal/results/HalfCheetah-v5_noise-0.2_sees_all_m100_k0": ("CausalGDP, sees everything", RED),
         "causal/results/HalfCheetah-v5_sac_m100_k0": ("SAC", GREY),
     },
     "Ant-v5 (105 observations)": {
