@@ -74,7 +74,8 @@ def execute(tmp_path, monkeypatch):
             kernel_name="python3",
             resources=resources,
         ).execute()
-        return json.loads(notebook.cells[-1].outputs[-1].text)
+        # What is printed at once may come in parts
+        return json.loads("".join(output.get("text", "") for output in notebook.cells[-1].outputs))
 
     return run
 
