@@ -88,8 +88,8 @@ class CausalGDPPolicy(AbstractingPolicy):
     :param state_guidance_scale: gamma, scales the precision of the next state
     :param outcome_guidance_scale: beta, scales the precision of the reward or return
     :param n_action_candidates: Number of candidates N from which prediction plays the best
-    :param exploration_noise: Standard deviation of the Gaussian noise of stochastic predictions, for actions in [-1, 1]; ``auto``
-        is 0.3 divided by the square root of the number of action components that are not hidden
+    :param exploration_noise: Standard deviation of the Gaussian noise of stochastic predictions, for actions in [-1, 1];
+        ``auto`` is 0.3 divided by the square root of the number of action components that are not hidden
     :param exploration_optimism: What stochastic predictions hope of a candidate: -1 for the smallest Q of the critics, 0 for
         their mean, 1 for the largest
     :param exploration_temperature: How random the choice among candidates is in stochastic predictions, 0 for the best
