@@ -12,7 +12,7 @@ from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy, ContinuousCritic
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule, TrainFreq, TrainFrequencyUnit
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule, TrainFreq
 from stable_baselines3.common.utils import FloatSchedule, update_learning_rate
 
 from sb3_causalgdp.acceleration.gradients import check_compile
@@ -24,6 +24,7 @@ from sb3_causalgdp.arguments import (
     check_action_space,
     check_arguments,
     check_keywords,
+    counts_episodes,
 )
 from sb3_causalgdp.callbacks.own import with_own
 from sb3_causalgdp.causal import CausalGraph
@@ -467,9 +468,9 @@ class CausalGDP(AskedAlgorithm, DistilledAlgorithm, CheckedAlgorithm):
         n_steps = self._total_timesteps - self._num_timesteps_at_start
         if self.is_pretraining or self.gradient_steps < 0:
             return n_steps
-        assert isinstance(self.train_freq, TrainFreq)
-        if self.train_freq.unit is TrainFrequencyUnit.EPISODE:
+        if counts_episodes(self.train_freq):
             return 0  # nobody knows how many
+        assert isinstance(self.train_freq, TrainFreq)
         return n_steps // (self.train_freq.frequency * self.n_envs) * self.gradient_steps
 
     def train(self, gradient_steps: int, batch_size: int = 256) -> None:

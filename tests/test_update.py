@@ -1,11 +1,10 @@
 """The fast parts of an update do what the plain ones do."""
 
-from functools import wraps
-
 import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
+from compiling import compile_for_tests
 from small_models import small
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
@@ -259,17 +258,6 @@ def weights_after(model, seed=3):
     # So many that every kind of step comes more than once
     model.train(gradient_steps=12, batch_size=32)
     return model.policy.state_dict()
-
-
-def compile_for_tests(monkeypatch, **options):
-    """Another backend than inductor's C++, whose compilation takes a minute; a graph that breaks is an error."""
-    compile_ = th.compile
-
-    @wraps(compile_)
-    def compile_whole(function, **kwargs):
-        return compile_(function, **{**kwargs, "options": None, "fullgraph": True, **options})
-
-    monkeypatch.setattr(th, "compile", compile_whole)
 
 
 def assert_same_weights(found, expected, **tolerances):

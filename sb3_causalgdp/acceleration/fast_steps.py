@@ -31,8 +31,9 @@ class FastSteps:
         self, optimizers: Sequence[th.optim.Optimizer], compile_mode: bool | str, cuda_graph: bool | str, device: th.device
     ) -> None:
         self._optimizers, self._cuda_graph, self._device = optimizers, cuda_graph, device
-        self._may_compile = compile_mode == "auto" and switch.is_on()
-        self._compile_mode = compile_mode if switch.is_on() and not self._may_compile else False
+        wanted = compile_mode if switch.is_on() else False
+        self._may_compile = wanted == "auto"
+        self._compile_mode = False if self._may_compile else wanted
         self.graphs: UpdateGraphs | None = None
         self.forget_recordings()
 

@@ -1,10 +1,10 @@
 """``compile="auto"``: who trains for long compiles, and nobody else notices."""
 
-from functools import wraps
 from threading import Thread
 
 import pytest
 import torch as th
+from compiling import compile_for_tests
 from stable_baselines3.common.envs import FakeImageEnv
 from stable_baselines3.common.torch_layers import FlattenExtractor
 from torch._dynamo.exc import BackendCompilerFailed
@@ -20,14 +20,8 @@ class OwnExtractor(FlattenExtractor):
     pass
 
 
-def compile_with(monkeypatch, backend):
-    compile_ = th.compile
-
-    @wraps(compile_)
-    def with_backend(function, options, **kwargs):
-        return compile_(function, backend=backend, **kwargs)
-
-    monkeypatch.setattr(th, "compile", with_backend)
+@pytest.fixture(autouse=True)
+def worth_compiling(monkeypatch):
     monkeypatch.setattr(FastSteps, "WORTH_COMPILING", N_STEPS)
 
 
@@ -40,7 +34,7 @@ def n_compiled(monkeypatch):
         graphs.append(graph)
         return graph
 
-    compile_with(monkeypatch, count)
+    compile_for_tests(monkeypatch, backend=count)
     return lambda: len(graphs)
 
 
@@ -120,7 +114,7 @@ def test_where_the_compiler_fails_the_training_says_so_once_and_is_the_plain_one
     def fails(graph, _):
         raise RuntimeError("no headers")
 
-    compile_with(monkeypatch, fails)
+    compile_for_tests(monkeypatch, backend=fails)
     model = make()
     with pytest.warns(UserWarning, match=r"cannot compile the updates, which go on as they are .*: .*no headers") as warned:
         model.learn(N_STEPS)
